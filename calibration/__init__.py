@@ -1,0 +1,1 @@
+"""Camera models, rigs and their calibration from pictures of a board."""

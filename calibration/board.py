@@ -1,0 +1,150 @@
+"""Calibration boards: what is printed on them, where they stood, and their points in a picture."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, field_validator
+
+from groundwork import InputError, StrictModel, check_format, read_yaml
+
+Array = NDArray[np.float64]
+
+FORMAT = "rafl-board/1"
+FEWEST_POINTS = 8
+
+
+class WorldPose(StrictModel):
+    """Where the board stood in one picture: its origin and the directions of its axes."""
+
+    origin_mm: tuple[float, float, float]
+    x_axis: tuple[float, float, float]
+    y_axis: tuple[float, float, float]
+
+    @field_validator("x_axis", "y_axis")
+    @classmethod
+    def _unit(cls, axis: tuple[float, float, float]) -> tuple[float, float, float]:
+        if abs(np.linalg.norm(axis) - 1.0) > 1e-6:
+            raise ValueError("expected a direction of length 1")
+        return axis
+
+    @property
+    def rotation(self) -> Array:
+        """Board to world, (3, 3)."""
+        x, y = np.asarray(self.x_axis), np.asarray(self.y_axis)
+        return np.stack([x, y, np.cross(x, y)], axis=1)
+
+    @property
+    def origin(self) -> Array:
+        """World position of the board's origin [m], (3)."""
+        return 1e-3 * np.asarray(self.origin_mm)
+
+
+class CharucoPattern(StrictModel):
+    """A ChArUco board: `squares` columns x rows; origin at the top left corner, x right, y down."""
+
+    kind: Literal["charuco"]
+    squares: tuple[int, int]
+    square_mm: float = Field(gt=0)
+    marker_mm: float = Field(gt=0)
+    dictionary: str = "DICT_4X4_250"
+
+    @field_validator("dictionary")
+    @classmethod
+    def _known(cls, name: str) -> str:
+        if not name.startswith("DICT_") or not hasattr(cv2.aruco, name):
+            raise ValueError("expected the name of an OpenCV dictionary, for instance DICT_4X4_250")
+        return name
+
+    def opencv_board(self) -> "cv2.aruco.CharucoBoard":
+        """OpenCV's description of it, lengths in metres."""
+        dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
+        return cv2.aruco.CharucoBoard(self.squares, 1e-3 * self.square_mm, 1e-3 * self.marker_mm, dictionary)
+
+    def find(self, image: NDArray[np.uint8]) -> tuple[Array, Array]:
+        """Board points (P, 2) [m] and their pixels (P, 2) in a grey image."""
+        board = self.opencv_board()
+        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
+        if ids is None or not len(ids):
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        points = np.asarray(board.getChessboardCorners(), dtype=float)[ids.ravel(), :2]
+        return points, np.asarray(corners, dtype=float).reshape(-1, 2)
+
+
+class DotGridPattern(StrictModel):
+    """A grid of `dots` columns x rows of dark dots; origin at the dot nearest the picture's top left."""
+
+    kind: Literal["dot-grid"]
+    dots: tuple[int, int]
+    spacing_mm: float = Field(gt=0)
+
+    def find(self, image: NDArray[np.uint8]) -> tuple[Array, Array]:
+        """Board points (P, 2) [m] and their pixels (P, 2) in a grey image."""
+        columns, rows = self.dots
+        found, centres = cv2.findCirclesGrid(image, (columns, rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
+        if not found:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        grid = np.asarray(centres, dtype=float).reshape(rows, columns, 2)
+        if grid[0, 0].sum() > grid[-1, -1].sum():
+            grid = grid[::-1, ::-1]
+        across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+        if across[0] * down[1] - across[1] * down[0] < 0:
+            grid = grid[:, ::-1]
+        j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+        points = 1e-3 * self.spacing_mm * np.stack([j, i], axis=-1)
+        return points.reshape(-1, 2), grid.reshape(-1, 2)
+
+
+class BoardFile(StrictModel):
+    """`board.yaml`: the pattern, and by picture (`camera/file`) where the board stood in the world."""
+
+    format: str
+    pattern: Annotated[CharucoPattern | DotGridPattern, Field(discriminator="kind")]
+    world: dict[str, WorldPose] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class View:
+    """The board in one picture.
+
+    Attributes:
+        name: `camera/file`.
+        points: on the board [m], (P, 2).
+        pixels: (P, 2).
+        pose: where the board stood, if known.
+    """
+
+    name: str
+    points: Array
+    pixels: Array
+    pose: WorldPose | None
+
+
+def read_board(path: Path) -> BoardFile:
+    """Read `board.yaml`.
+
+    Raises:
+        InputError: missing, damaged, or of a newer version.
+    """
+    board = read_yaml(path, BoardFile, "a board description (board.yaml)")
+    check_format(board.format, FORMAT, path)
+    return board
+
+
+def find_board(path: Path, name: str, board: BoardFile) -> tuple[View | None, tuple[int, int]]:
+    """The board in a picture (None where too little of it is seen), and the picture's size.
+
+    Raises:
+        InputError: the picture cannot be read.
+    """
+    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise InputError(f"expected a picture of the board in {path}, which cannot be read; replace it")
+    size = (image.shape[1], image.shape[0])
+    points, pixels = board.pattern.find(image)
+    if len(points) < FEWEST_POINTS:
+        return None, size
+    return View(name, points, pixels, board.world.get(name)), size

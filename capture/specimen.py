@@ -1,0 +1,126 @@
+"""`specimen.yaml`: what a specimen is, and the simulator it is given."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from groundwork import InputError, StrictModel, check_format, read_yaml
+from rafl.markers import Markers, embed, embedding_gap
+from rafl.material import Material
+from rafl.mesh import HexMesh
+from rafl.simulator import Simulator
+from tracking.layout import SPECIMEN_FORMAT, MarkerEntry, MarkerLayout
+
+Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
+
+
+class _Geometry(StrictModel):
+    box_mm: tuple[float, float, float]
+    element_mm: float = Field(gt=0)
+
+    @model_validator(mode="after")
+    def _whole_cells(self) -> "_Geometry":
+        for size in self.box_mm:
+            cells = size / self.element_mm
+            if size <= 0 or abs(cells - round(cells)) > 1e-6:
+                raise ValueError(f"expected sides that are whole multiples of {self.element_mm} mm")
+        return self
+
+
+class _Material(StrictModel):
+    youngs_modulus: float = Field(gt=0)
+    poissons_ratio: float = Field(gt=-1, lt=0.5)
+    density: float = Field(gt=0)
+    mass: Literal["uniform", "lumped"] = "uniform"
+
+
+class _Clamp(StrictModel):
+    face: Face
+    markers: list[MarkerEntry] = Field(default_factory=list)
+
+
+class _Load(StrictModel):
+    face: Face
+
+
+class _SpecimenFile(StrictModel):
+    format: str
+    name: str = Field(pattern=r"^[\w.-]+$")
+    geometry: _Geometry
+    material: _Material
+    clamp: _Clamp
+    load: _Load = _Load(face="x-max")
+    markers: list[MarkerEntry] = Field(min_length=1)
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """A specimen as described.
+
+    Attributes:
+        name: of the specimen.
+        mesh: at rest, specimen frame.
+        material: assumed.
+        fixed: clamped nodes, (F).
+        loaded: nodes a load hangs on, (L).
+        layout: of the markers on the skin.
+        clamp_layout: of the markers on the clamp; may be empty.
+        text: of the file.
+    """
+
+    name: str
+    mesh: HexMesh
+    material: Material
+    fixed: np.ndarray
+    loaded: np.ndarray
+    layout: MarkerLayout
+    clamp_layout: MarkerLayout
+    text: str
+
+    def simulator(self, time_step: float, material: Material | None = None) -> Simulator:
+        """A simulator of this specimen, of its assumed material unless another is given."""
+        return Simulator(self.mesh, material or self.material, self.fixed, time_step)
+
+    def markers(self, tolerance: float) -> Markers:
+        """The markers tied to the mesh.
+
+        Raises:
+            InputError: a marker stands further than `tolerance` [m] off the surface.
+        """
+        markers = embed(self.mesh, self.layout.names, self.layout.positions)
+        off = np.maximum(np.abs(markers.normal_offset), embedding_gap(self.mesh, markers))
+        if (off > tolerance).any():
+            worst = int(np.argmax(off))
+            raise InputError(
+                f"specimen {self.name}: marker {markers.names[worst]} at "
+                f"{np.round(1e3 * markers.rest[worst], 3).tolist()} mm lies {1e3 * off[worst]:.2f} mm off the "
+                f"surface, expected at most {1e3 * tolerance:g} mm; correct at_mm, or allow it "
+                "with --tolerance-mm"
+            )
+        return markers
+
+
+def read_specimen(path: Path) -> Specimen:
+    """Read `specimen.yaml`.
+
+    Raises:
+        InputError: missing, damaged, or of a newer version.
+    """
+    content = read_yaml(path, _SpecimenFile, "a specimen (specimen.yaml)")
+    check_format(content.format, SPECIMEN_FORMAT, path)
+    size = 1e-3 * np.array(content.geometry.box_mm)
+    cells = np.round(np.array(content.geometry.box_mm) / content.geometry.element_mm).astype(int)
+    mesh = HexMesh.box(cells, size)
+    return Specimen(
+        content.name,
+        mesh,
+        Material(**content.material.model_dump()),
+        mesh.face_nodes(content.clamp.face),
+        mesh.face_nodes(content.load.face),
+        MarkerLayout.of(content.markers),
+        MarkerLayout.of(content.clamp.markers),
+        path.read_text(encoding="utf-8"),
+    )

@@ -1,0 +1,1 @@
+"""Specimen descriptions and built dataset files; no code."""

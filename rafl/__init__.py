@@ -1,0 +1,1 @@
+"""Differentiable soft-body simulation, residual acceleration fields, fitting and evaluation."""

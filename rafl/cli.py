@@ -1,0 +1,169 @@
+"""The commands `rafl-fit` and `rafl-eval`."""
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import torch
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from groundwork import InputError, command_line, progress, user_command, write_text
+from rafl.dataset import Dataset, read_dataset
+from rafl.evaluation import Comparison, compare, error_table, held_out_errors, split_table
+from rafl.fit import fit_residual_field
+from rafl.report import write_report
+from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
+from rafl.simulator import SimulationError
+from rafl.sysid import identify_material
+
+fit_app = command_line("Fit a model to recordings.")
+eval_app = command_line("Measure a fitted model.")
+
+
+class Method(StrEnum):
+    """What to fit."""
+
+    rafl = "rafl"
+    sysid = "sysid"
+
+
+def _simulating(error: SimulationError) -> typer.Exit:
+    typer.echo(f"error: {error}", err=True)
+    return typer.Exit(1)
+
+
+@fit_app.command()
+@user_command
+def fit(
+    datasets: Annotated[
+        list[Path], typer.Argument(help="Dataset files (.h5) to train on.", metavar="DATASET...")
+    ],
+    method: Annotated[Method, typer.Option(help="rafl: residual field; sysid: E and nu.")] = Method.rafl,
+    out: Annotated[Path | None, typer.Option(help="Run folder [runs/<dataset>-<method>].")] = None,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the recordings, at most.")] = 60,
+    learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start.")] = 2e-3,
+    weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's.")] = 1e-5,
+    patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping.")] = 20,
+    frames: Annotated[int, typer.Option(min=0, help="Leading frames to train on (0: all).")] = 0,
+    seed: Annotated[int, typer.Option(help="Of weights and order.")] = 0,
+    resume: Annotated[bool, typer.Option(help="Go on with a run that was interrupted.")] = False,
+) -> None:
+    """Train on the `train` recordings, watch the `val` ones, keep the best.
+
+    Example: rafl-fit datasets/thick.h5 --out runs/thick
+    """
+    torch.set_num_threads(2)
+    loaded = [read_dataset(path) for path in datasets]
+    run = out or Path("runs") / f"{loaded[0].name}-{method.value}"
+    settings = Settings(
+        method.value, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
+        weight_decay, patience, frames, seed,
+    )  # fmt: skip
+    _open_run(run, settings, resume)
+    with progress() as bar:
+        task = bar.add_task("epoch", total=epochs)
+
+        def report(row: dict[str, float]) -> None:
+            bar.update(task, completed=row["epoch"])
+            values = ", ".join(f"{key} {value:.5g}" for key, value in row.items() if key != "epoch")
+            bar.console.print(f"epoch {row['epoch']:3.0f}: {values}", highlight=False)
+
+        try:
+            method_of = fit_residual_field if method is Method.rafl else identify_material
+            model = method_of(loaded, settings, run, report)
+        except SimulationError as error:
+            raise _simulating(error) from None
+    typer.echo(_described(model))
+    typer.echo(f"wrote {run}/ (model.pt, history.csv, config.yaml)")
+    typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in datasets)}")
+
+
+def _open_run(run: Path, settings: Settings, resume: bool) -> None:
+    """Make or reopen the run folder; never mix two runs in one."""
+    if resume:
+        earlier = read_settings(run)
+        if earlier != settings:
+            raise InputError(
+                f"expected the settings in {run}/config.yaml to resume, found others; use the same"
+            )
+        return
+    if (run / "config.yaml").exists():
+        raise InputError(f"{run} already holds a run; choose another --out, or go on with --resume")
+    write_settings(run, settings)
+
+
+def _described(model: FittedModel) -> str:
+    if model.material is not None:
+        return f"identified E = {model.material[0] / 1e3:.1f} kPa, nu = {model.material[1]:.4f}"
+    return "trained a residual acceleration field"
+
+
+@eval_app.command()
+@user_command
+def evaluate(
+    paths: Annotated[
+        list[Path], typer.Argument(help="Run folders and dataset files (.h5).", metavar="RUN... DATASET...")
+    ],
+    out: Annotated[
+        Path | None, typer.Option(help="Folder for errors.csv and report.html [the first run].")
+    ] = None,
+) -> None:
+    """Compare original and fitted simulators with the recordings.
+
+    Example: rafl-eval runs/thick datasets/thick.h5 datasets/thin.h5
+    """
+    torch.set_num_threads(2)
+    runs = [path for path in paths if path.suffix != ".h5"]
+    files = [path for path in paths if path.suffix == ".h5"]
+    if not runs or not files:
+        raise InputError(
+            f"expected at least one run folder and one dataset (.h5), found {len(runs)} and {len(files)}; "
+            "for instance rafl-eval runs/thick datasets/thick.h5"
+        )
+    models = _named_models(runs)
+    datasets = [read_dataset(path) for path in files]
+    try:
+        comparisons = _compare_all(datasets, models)
+    except SimulationError as error:
+        raise _simulating(error) from None
+    folder = out or runs[0]
+    recordings, splits = error_table(comparisons), split_table(comparisons)
+    write_text(folder / "errors.csv", recordings.to_csv(index=False, float_format="%.6f"))
+    described = "; ".join(f"{name}: {_described(model)}" for name, model in models.items())
+    write_report(folder / "report.html", comparisons, splits, recordings, described)
+    table = Table("dataset", "split", "recordings", "method", "error [mm]")
+    for row in splits.itertuples():
+        error = f"{row.mean_mm:.3f} +- {row.std_mm:.3f}"
+        table.add_row(row.dataset, row.split, str(row.recordings), row.method, error)
+    Console(width=100).print(table)
+    typer.echo(f"wrote {folder / 'errors.csv'}")
+    held_out = held_out_errors(comparisons)
+    if held_out:
+        fitted = next(iter(models))
+        typer.echo(
+            f"held-out marker error: original {1e3 * held_out['original']:.3f} mm, "
+            f"fitted {1e3 * held_out[fitted]:.3f} mm"
+        )
+    else:
+        typer.echo("no recording has split `test`: nothing was held out", err=True)
+    typer.echo(f"report: {folder / 'report.html'} (open it in a browser)")
+
+
+def _compare_all(datasets: list[Dataset], models: dict[str, FittedModel]) -> list[Comparison]:
+    comparisons: list[Comparison] = []
+    with progress() as bar:
+        for dataset in bar.track(datasets, description="simulating"):
+            comparisons += compare(dataset, models)
+    return comparisons
+
+
+def _named_models(runs: list[Path]) -> dict[str, FittedModel]:
+    """Models by method; by method and folder where a method occurs twice."""
+    models = [load_model(run) for run in runs]
+    methods = [model.method for model in models]
+    return {
+        model.method if methods.count(model.method) == 1 else f"{model.method} ({run.name})": model
+        for run, model in zip(runs, models, strict=True)
+    }

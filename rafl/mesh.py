@@ -1,0 +1,109 @@
+"""Hexahedral meshes: vertices, cells, quadrature and boundary."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=float)
+
+# The four corners of each side of a cell, anticlockwise seen from outside.
+CELL_SIDES = {
+    "x-min": (0, 1, 3, 2),
+    "x-max": (4, 6, 7, 5),
+    "y-min": (0, 4, 5, 1),
+    "y-max": (2, 3, 7, 6),
+    "z-min": (0, 2, 6, 4),
+    "z-max": (1, 5, 7, 3),
+}
+
+
+@dataclass(frozen=True)
+class Quadrature:
+    """The 8 Gauss points of each cell.
+
+    Attributes:
+        shape: shape functions at the points, (8 points, 8 nodes); the same in every cell.
+        gradient: rest-frame shape function gradients [1/m], (E, 8 points, 8 nodes, 3).
+        volume: quadrature weight times Jacobian [m^3], (E, 8 points).
+    """
+
+    shape: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    volume: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class HexMesh:
+    """Trilinear hexahedra.
+
+    Attributes:
+        vertices: rest positions [m], (N, 3).
+        hexes: vertex indices of each cell, (E, 8); node (i, j, k) of a cell stands at 4i + 2j + k.
+    """
+
+    vertices: NDArray[np.float64]
+    hexes: NDArray[np.int64]
+
+    @classmethod
+    def box(cls, cells: ArrayLike, size: ArrayLike) -> "HexMesh":
+        """A box of `cells` (3) cells and `size` (3) [m], one corner at the origin, z fastest."""
+        nx, ny, nz = (int(n) for n in np.asarray(cells))
+        axes = [np.linspace(0.0, s, n + 1) for s, n in zip(np.asarray(size), (nx, ny, nz), strict=True)]
+        vertices = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+        i, j, k = (a.ravel() for a in np.meshgrid(*map(np.arange, (nx, ny, nz)), indexing="ij"))
+        corners = [
+            ((i + int(di)) * (ny + 1) + j + int(dj)) * (nz + 1) + k + int(dk) for di, dj, dk in CORNERS
+        ]
+        return cls(vertices, np.stack(corners, axis=1).astype(np.int64))
+
+    @cached_property
+    def quadrature(self) -> Quadrature:
+        """Gauss points at (0.5 -+ 0.5/sqrt 3) in node order.
+
+        Raises:
+            ValueError: a cell is inverted or flat; its index is in the message.
+        """
+        points = 0.5 + (CORNERS - 0.5) / np.sqrt(3.0)
+        factors = np.where(CORNERS[None] > 0.5, points[:, None], 1.0 - points[:, None])  # (8, 8, 3)
+        slopes = np.where(CORNERS > 0.5, 1.0, -1.0)
+        local = np.stack(
+            [slopes[:, a] * factors[:, :, (a + 1) % 3] * factors[:, :, (a + 2) % 3] for a in range(3)],
+            axis=-1,
+        )  # (8 points, 8 nodes, 3)
+        jacobian = np.einsum("eni,gnj->egij", self.vertices[self.hexes], local)
+        determinant = np.linalg.det(jacobian)
+        if (determinant <= 0.0).any():
+            worst = int(np.argmin(determinant.min(axis=1)))
+            raise ValueError(
+                f"cell {worst} is inverted or flat (Jacobian {determinant[worst].min():.3g} m^3); "
+                "its eight nodes must run z fastest, then y, then x"
+            )
+        gradient = np.einsum("gnj,egji->egni", local, np.linalg.inv(jacobian))
+        return Quadrature(factors.prod(axis=-1), np.ascontiguousarray(gradient), determinant / 8.0)
+
+    @cached_property
+    def volumes(self) -> NDArray[np.float64]:
+        """Volume of each cell [m^3], (E,)."""
+        return self.quadrature.volume.sum(axis=1)
+
+    @cached_property
+    def surface(self) -> NDArray[np.int64]:
+        """Boundary quads (S, 4): vertices anticlockwise seen from outside."""
+        quads = np.concatenate([self.hexes[:, side] for side in CELL_SIDES.values()])
+        _, first, counts = np.unique(np.sort(quads, axis=1), axis=0, return_index=True, return_counts=True)
+        return quads[np.sort(first[counts == 1])]
+
+    def face_nodes(self, face: str) -> NDArray[np.int64]:
+        """Vertices on the bounding-box face `x-min` ... `z-max`.
+
+        Raises:
+            ValueError: no such face.
+        """
+        if face not in CELL_SIDES:
+            raise ValueError(f"expected a face among {', '.join(CELL_SIDES)}, got {face!r}")
+        axis = "xyz".index(face[0])
+        along = self.vertices[:, axis]
+        end = along.min() if face.endswith("min") else along.max()
+        return np.flatnonzero(np.abs(along - end) < 1e-6 * np.ptp(along))

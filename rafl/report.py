@@ -1,0 +1,139 @@
+"""`report.html` of an evaluation: one file with its tables and plots inside."""
+
+import base64
+import io
+from pathlib import Path
+
+import jinja2
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from groundwork import write_text
+from rafl.evaluation import ORIGINAL, Comparison
+
+COLOURS = ["#c0392b", "#1f6fb2", "#2e8b57", "#8e44ad", "#d68910"]
+MOST_PLOTS = 8
+
+PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Evaluation</title>
+<style>
+ body{font:16px/1.5 system-ui,sans-serif;max-width:62rem;margin:2rem auto;padding:0 1rem;color:#222}
+ table{border-collapse:collapse;margin:1rem 0}
+ th,td{padding:.25rem .8rem;text-align:right;border-bottom:1px solid #ddd}
+ td:nth-child(-n+2),th:nth-child(-n+2){text-align:left}
+ .better{text-decoration:underline}.best{font-weight:bold}
+ img{max-width:100%} .note{color:#666}
+</style>
+<h1>Simulated against recorded markers</h1>
+<p>Mean distance between simulated and recorded markers in mm, &plusmn; the standard deviation over frames.
+Underlined: better than the original simulator. Bold: the best of its row.</p>
+<table><tr><th>dataset</th><th>split</th><th>recordings</th>
+{% for m in methods %}<th>{{ m }}</th>{% endfor %}</tr>
+{% for row in splits %}<tr><td>{{ row.dataset }}</td><td>{{ row.split }}</td><td>{{ row.recordings }}</td>
+{% for cell in row.cells %}<td class="{{ cell.style }}">{{ cell.text }}</td>{% endfor %}</tr>
+{% endfor %}</table>
+<h2>Error over time</h2>
+{% for image in error_plots %}<img alt="error over time" src="data:image/png;base64,{{ image }}">{% endfor %}
+<h2>Marker trajectories</h2>
+<p class="note">The marker that moves most, along the axis it moves most. Black: recorded.
+{% if left_out %}{{ left_out }} further recordings are in errors.csv only.{% endif %}</p>
+{% for image in marker_plots %}<img alt="marker trajectory" src="data:image/png;base64,{{ image }}">{% endfor %}
+<h2>Every recording</h2>
+<table><tr><th>dataset</th><th>recording</th><th>split</th>
+{% for m in methods %}<th>{{ m }}</th>{% endfor %}</tr>
+{% for row in recordings %}<tr><td>{{ row.dataset }}</td><td>{{ row.recording }}</td><td>{{ row.split }}</td>
+{% for cell in row.cells %}<td class="{{ cell.style }}">{{ cell.text }}</td>{% endfor %}</tr>
+{% endfor %}</table>
+<p class="note">{{ models }}</p></html>
+"""
+
+
+def _png(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    plt.close(figure)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def _error_plot(dataset: str, comparisons: list[Comparison]) -> str:
+    figure, axes = plt.subplots(figsize=(9, 3.2), layout="constrained")
+    held_out = [item for item in comparisons if item.split == "test"] or comparisons
+    for colour, method in zip(COLOURS, held_out[0].errors, strict=False):
+        for number, item in enumerate(held_out):
+            label = method if number == 0 else None
+            axes.plot(item.error_time, 1e3 * item.errors[method], color=colour, label=label, alpha=0.75)
+    axes.set(xlabel="time [s]", ylabel="marker error [mm]", ylim=(0, None))
+    axes.set_title(f"{dataset}: {held_out[0].split} recordings")
+    axes.legend()
+    return _png(figure)
+
+
+def _marker_plot(item: Comparison) -> str:
+    reach = np.nanmax(item.recorded, axis=0) - np.nanmin(item.recorded, axis=0)
+    marker, axis = np.unravel_index(np.nanargmax(reach), reach.shape)
+    figure, axes = plt.subplots(figsize=(9, 2.8), layout="constrained")
+    axes.plot(item.time, 1e3 * item.recorded[:, marker, axis], "k.", markersize=4, label="recorded")
+    for colour, (method, markers) in zip(COLOURS, item.simulated.items(), strict=False):
+        axes.plot(item.time, 1e3 * markers[:, marker, axis], color=colour, label=method)
+    axes.set(xlabel="time [s]", ylabel=f"{'xyz'[axis]} of {item.marker_names[marker]} [mm]")
+    axes.set_title(f"{item.dataset} / {item.recording} ({item.split})")
+    axes.legend(loc="upper right")
+    return _png(figure)
+
+
+def _cells(means: dict[str, float], stds: dict[str, float]) -> list[dict[str, str]]:
+    best = min(means.values())
+    return [
+        {
+            "text": f"{means[method]:.3f} \N{PLUS-MINUS SIGN} {stds[method]:.3f}",
+            "style": " ".join(
+                name
+                for name, holds in (
+                    ("better", method != ORIGINAL and means[method] < means[ORIGINAL]),
+                    ("best", means[method] == best),
+                )
+                if holds
+            ),
+        }
+        for method in means
+    ]
+
+
+def _rows(table: pd.DataFrame, keys: list[str]) -> list[dict[str, object]]:
+    rows = []
+    for values, group in table.groupby(keys, sort=False):
+        means = dict(zip(group["method"], group["mean_mm"], strict=True))
+        stds = dict(zip(group["method"], group["std_mm"], strict=True))
+        rows.append({**dict(zip(keys, values, strict=True)), "cells": _cells(means, stds)})
+    return rows
+
+
+def write_report(
+    path: Path, comparisons: list[Comparison], splits: pd.DataFrame, recordings: pd.DataFrame, models: str
+) -> None:
+    """Write the report.
+
+    Args:
+        path: of the HTML file.
+        comparisons: what to plot.
+        splits: from `split_table`.
+        recordings: from `error_table`.
+        models: one line on the fitted models.
+    """
+    plt.switch_backend("agg")
+    by_dataset: dict[str, list[Comparison]] = {}
+    for item in comparisons:
+        by_dataset.setdefault(item.dataset, []).append(item)
+    shown = sorted(comparisons, key=lambda item: item.split != "test")[:MOST_PLOTS]
+    page = jinja2.Environment(autoescape=True).from_string(PAGE)
+    text = page.render(
+        methods=list(comparisons[0].errors),
+        splits=_rows(splits, ["dataset", "split", "recordings"]),
+        recordings=_rows(recordings, ["dataset", "recording", "split"]),
+        error_plots=[_error_plot(name, items) for name, items in by_dataset.items()],
+        marker_plots=[_marker_plot(item) for item in shown],
+        left_out=len(comparisons) - len(shown),
+        models=models,
+    )
+    write_text(path, text)

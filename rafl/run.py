@@ -1,0 +1,143 @@
+"""A run folder: the fitted model, its settings, its history and where to resume."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import pandas as pd
+import torch
+import yaml
+
+from groundwork import InputError, check_format, require_file, whole_file, write_text
+from rafl.residual import ResidualField
+from rafl.rollout import ResidualForce
+from rafl.simulator import Simulator
+
+FORMAT = "rafl-run/1"
+
+
+@dataclass(frozen=True)
+class FittedModel:
+    """What a fit leaves: a residual field, or identified material parameters.
+
+    Attributes:
+        method: `rafl` or `sysid`.
+        field: the residual acceleration field, for `rafl`.
+        material: Young's modulus [Pa] and Poisson's ratio, for `sysid`.
+    """
+
+    method: str
+    field: ResidualField | None = None
+    material: tuple[float, float] | None = None
+
+    def residual(self, simulator: Simulator) -> ResidualForce | None:
+        """The residual force on a specimen, if this model has one."""
+        return self.field.on(simulator) if self.field is not None else None
+
+    def material_tensors(self) -> tuple[torch.Tensor, torch.Tensor] | None:
+        """The material to simulate with, if this model has one."""
+        if self.material is None:
+            return None
+        e, nu = (torch.tensor(value, dtype=torch.float64) for value in self.material)
+        return e, nu
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a model was fitted; `config.yaml` in the run folder.
+
+    Attributes:
+        method: `rafl` or `sysid`.
+        datasets: absolute paths of the dataset files.
+        epochs: passes over the training recordings, at most.
+        learning_rate: Adam's, at the start of the cosine decay.
+        weight_decay: Adam's.
+        patience: epochs without a better validation error before training stops.
+        frames: leading frames of each recording used for training (all when 0).
+        seed: of the initial weights and the order of recordings.
+    """
+
+    method: str
+    datasets: tuple[str, ...]
+    epochs: int
+    learning_rate: float
+    weight_decay: float
+    patience: int
+    frames: int
+    seed: int
+
+
+def write_settings(run: Path, settings: Settings) -> None:
+    """Write `config.yaml`."""
+    content = {"format": FORMAT, **asdict(settings), "datasets": list(settings.datasets)}
+    write_text(run / "config.yaml", yaml.safe_dump(content, sort_keys=False))
+
+
+def read_settings(run: Path) -> Settings:
+    """Read `config.yaml`.
+
+    Raises:
+        InputError: not a run folder, or a newer one.
+    """
+    path = require_file(run / "config.yaml", "a run folder's settings (written by rafl-fit)")
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        check_format(str(content.pop("format", "")), FORMAT, path)
+        return Settings(**{**content, "datasets": tuple(content["datasets"])})
+    except (yaml.YAMLError, TypeError, KeyError, AttributeError) as error:
+        raise InputError(f"expected settings written by rafl-fit in {path}: {error}; fit again") from None
+
+
+def save_tensors(path: Path, content: dict[str, object]) -> None:
+    """Save tensors and plain values, whole or not at all."""
+    with whole_file(path) as temporary:
+        torch.save(content, temporary)
+
+
+def load_tensors(path: Path, what: str) -> dict:
+    """Load what `save_tensors` wrote; nothing in the file is executed.
+
+    Raises:
+        InputError: missing, of another kind or damaged.
+    """
+    require_file(path, what)
+    try:
+        content = torch.load(path, weights_only=True)
+    except Exception as error:  # torch raises many kinds here; all mean the same to the user
+        reason = str(error).splitlines()[0]
+        raise InputError(
+            f"expected {what} in {path}, which cannot be read: {reason:.120}; fit again"
+        ) from None
+    if not isinstance(content, dict) or "method" not in content:
+        raise InputError(f"expected {what} in {path}, found something else; fit again")
+    check_format(str(content.get("format", "")), FORMAT, path)
+    return content
+
+
+def save_model(run: Path, model: FittedModel) -> None:
+    """Write `model.pt`."""
+    content: dict[str, object] = {"format": FORMAT, "method": model.method}
+    if model.field is not None:
+        content["field"] = model.field.state_dict()
+    if model.material is not None:
+        content["material"] = list(model.material)
+    save_tensors(run / "model.pt", content)
+
+
+def load_model(run: Path) -> FittedModel:
+    """Read `model.pt`.
+
+    Raises:
+        InputError: missing, damaged, or written by a newer version.
+    """
+    content = load_tensors(run / "model.pt", "a fitted model (written by rafl-fit)")
+    if content["method"] == "sysid":
+        e, nu = content["material"]
+        return FittedModel("sysid", material=(e, nu))
+    field = ResidualField()
+    field.load_state_dict(content["field"])
+    return FittedModel("rafl", field=field)
+
+
+def write_history(run: Path, rows: list[dict[str, float]]) -> None:
+    """Write `history.csv`, a row an epoch."""
+    write_text(run / "history.csv", pd.DataFrame(rows).to_csv(index=False))

@@ -1,0 +1,1 @@
+"""Dots in videos: found, followed, named and placed in 3-D."""

@@ -1,0 +1,140 @@
+"""Which dot is which marker of the layout."""
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, QhullError, cKDTree
+
+from calibration.camera import OrthographicCamera
+from groundwork import InputError
+from tracking.layout import MarkerLayout
+
+Array = NDArray[np.float64]
+
+NEAR = 0.4  # of the local spacing: how far a dot may be from where its neighbours put it
+TURNS = np.radians(np.concatenate([[0], np.repeat(np.arange(15, 181, 15), 2) * np.tile([1, -1], 12)]))
+
+
+def visible_markers(layout: MarkerLayout, camera: OrthographicCamera) -> NDArray[np.int64]:
+    """Indices of the markers on the side of the specimen that faces the camera.
+
+    The sides are the flat parts of the layout's convex hull; a layout in one plane is all seen.
+    """
+    points = layout.positions
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError):
+        return np.arange(len(points))
+    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
+    on = np.abs(points @ normals.T + offsets) < 1e-3 * np.ptp(points, axis=0).max()
+    facing = normals @ camera.viewing_direction < -0.5
+    return np.flatnonzero((on & facing).any(axis=1))
+
+
+def name_by_layout(dots: Array, layout: MarkerLayout, camera: OrthographicCamera, what: str) -> list[int]:
+    """The layout marker of each dot (-1 for none).
+
+    A dot and a marker are taken to be the same, and names spread from there from neighbour to
+    neighbour, each step trusting the local affine map; of all such beginnings the one that names
+    most dots with the least bending wins. Only proper rotations are tried: a mirror image of the
+    layout is no match.
+
+    Args:
+        dots: first frame [px], (D, 2).
+        layout: of the whole specimen.
+        camera: that filmed.
+        what: video, for messages.
+
+    Raises:
+        InputError: fewer than three dots match the layout.
+    """
+    markers = visible_markers(layout, camera)
+    pixels = camera.undistort(dots)
+    expected = layout.positions[markers] @ camera.matrix.T + np.asarray(camera.offset)
+    best: tuple[float, dict[int, int]] = (-np.inf, {})
+    complete = min(len(dots), len(markers))
+    for turn in TURNS:
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        for matches in _beginnings(expected, pixels, rotation):
+            # The calibrated position decides between a layout and its shifted copy.
+            away = np.mean([np.linalg.norm(pixels[d] - expected[m]) for m, d in matches.items()])
+            score = len(matches) - 0.3 * min(away / np.ptp(expected, axis=0).max(), 1.0)
+            if score > best[0]:
+                best = (score, matches)
+        if len(best[1]) == complete:
+            break
+    if len(best[1]) < 3:
+        raise InputError(
+            f"{what}: expected dots in the pattern of the specimen's markers, found {len(best[1])} of "
+            f"{len(markers)} that match; check --specimen, and that calib.yaml belongs to this set-up"
+        )
+    names = [-1] * len(dots)
+    for marker, dot in best[1].items():
+        names[dot] = int(markers[marker])
+    return names
+
+
+def _beginnings(expected: Array, dots: Array, rotation: Array) -> list[dict[int, int]]:
+    """Matches grown from every marker and its five likeliest dots."""
+    turned = (expected - expected.mean(0)) @ rotation.T + expected.mean(0)
+    likely = cKDTree(dots).query(turned, min(5, len(dots)))[1].reshape(len(expected), -1)
+    grown = []
+    for marker in range(0, len(expected), max(len(expected) // 8, 1)):
+        for dot in likely[marker]:
+            grown.append(_grow(expected, dots, rotation, marker, int(dot)))
+            if len(grown[-1]) == min(len(dots), len(expected)):
+                return grown
+    return grown
+
+
+def _grow(expected: Array, dots: Array, rotation: Array, marker: int, dot: int) -> dict[int, int]:
+    tree = cKDTree(dots)
+    between = np.linalg.norm(expected[:, None] - expected[None], axis=2)
+    spacing = np.sort(between + np.diag(np.full(len(expected), np.inf)), axis=1)[:, 0]
+    matches = {marker: dot}
+    taken = {dot}
+    rejected: set[int] = set()
+    while len(matches) + len(rejected) < len(expected):
+        known = np.array(list(matches))
+        rest = [m for m in range(len(expected)) if m not in matches and m not in rejected]
+        nearest = min(rest, key=lambda m: between[m, known].min())
+        around = known[np.argsort(between[nearest, known])[:5]]
+        prediction = _carried(expected, dots, rotation, matches, around, nearest)
+        distance, found = tree.query(prediction)
+        if distance < NEAR * spacing[nearest] and int(found) not in taken:
+            matches[nearest] = int(found)
+            taken.add(int(found))
+        else:
+            rejected.add(nearest)
+    return matches
+
+
+def _carried(
+    expected: Array, dots: Array, rotation: Array, matches: dict[int, int], around: Array, marker: int
+) -> Array:
+    """Where the neighbours' affine map, drawn towards the start's rotation, puts a marker."""
+    source = expected[around]
+    target = dots[[matches[int(m)] for m in around]]
+    weight = 1.0 / (1e-9 + np.linalg.norm(source - expected[marker], axis=1))
+    weight /= weight.sum()
+    source_mean, target_mean = weight @ source, weight @ target
+    source, target = source - source_mean, target - target_mean
+    size = (weight[:, None] * source**2).sum()
+    ridge = 0.3 * size + 1e-9
+    moment = (weight[:, None] * source).T @ source
+    affine = ((weight[:, None] * target).T @ source + ridge * rotation) @ np.linalg.inv(
+        moment + ridge * np.eye(2)
+    )
+    return target_mean + affine @ (expected[marker] - source_mean)
+
+
+def name_by_rows(dots: Array) -> list[str]:
+    """Names r1c1, r1c2, ... by row from the top and column from the left."""
+    spacing = float(np.median(cKDTree(dots).query(dots, 2)[0][:, 1]))
+    order = np.argsort(dots[:, 1])
+    breaks = np.concatenate([[0], np.cumsum(np.diff(dots[order, 1]) > 0.4 * spacing)])
+    names = [""] * len(dots)
+    for row in range(int(breaks[-1]) + 1):
+        members = order[breaks == row]
+        for column, dot in enumerate(members[np.argsort(dots[members, 0])]):
+            names[dot] = f"r{row + 1}c{column + 1}"
+    return names

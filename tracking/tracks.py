@@ -1,0 +1,101 @@
+"""The tracks file: 3-D markers of one recording over time."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import h5py
+import numpy as np
+from numpy.typing import NDArray
+
+from groundwork import VERSION, InputError, check_format, require_file, whole_file
+
+Array = NDArray[np.float64]
+
+FORMAT = "rafl-tracks/1"
+MISSING, MEASURED, FILLED = 0, 1, 2
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """Markers of one recording, world frame.
+
+    Attributes:
+        names: of the markers, (M).
+        time: [s], (T).
+        position: [m], (T, M, 3), NaN where missing.
+        sigma: one standard deviation [m], (T, M, 3).
+        state: 0 missing, 1 measured, 2 filled, (T, M).
+        pixel: by camera (T, M, 2) [px], NaN where not seen.
+        residual: reprojection residual by camera, (T, M) [px].
+        pixel_sigma: one standard deviation of each pixel by camera, (T, M) [px].
+        fps: frames per second.
+        calibration: text of calib.yaml; empty for positions from elsewhere.
+        sources: SHA-256 by source file.
+        settings: text of the settings used.
+    """
+
+    names: tuple[str, ...]
+    time: Array
+    position: Array
+    sigma: Array
+    state: NDArray[np.uint8]
+    pixel: dict[str, Array]
+    residual: dict[str, Array]
+    pixel_sigma: dict[str, Array]
+    fps: float
+    calibration: str
+    sources: dict[str, str]
+    settings: str
+
+
+def write_tracks(path: Path, tracks: Tracks) -> None:
+    """Write a tracks file, whole or not at all."""
+    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+        file.attrs.update(
+            {
+                "format": FORMAT,
+                "marker_names": np.array(tracks.names, dtype=h5py.string_dtype()),
+                "fps": tracks.fps,
+                "units": "s, m, px; world frame of the calibration",
+                "calibration": tracks.calibration,
+                "software": f"rafl {VERSION}",
+                "settings": tracks.settings,
+                "sources": np.array([f"{h}  {n}" for n, h in tracks.sources.items()], h5py.string_dtype()),
+            }
+        )
+        for key in ("time", "position", "sigma", "state"):
+            file.create_dataset(key, data=getattr(tracks, key), fletcher32=True)
+        for name in tracks.pixel:
+            for key in ("pixel", "residual", "pixel_sigma"):
+                file[f"cameras/{name}/{key}"] = getattr(tracks, key)[name]
+
+
+def read_tracks(path: Path) -> Tracks:
+    """Read a tracks file.
+
+    Raises:
+        InputError: missing, not a tracks file, newer, or damaged.
+    """
+    require_file(path, "a tracks file (.h5)")
+    try:
+        with h5py.File(path, "r") as file:
+            check_format(str(file.attrs.get("format", "")), FORMAT, path)
+            cameras = file.get("cameras", {})
+            lines = [str(line).split("  ", 1) for line in file.attrs["sources"]]
+            return Tracks(
+                tuple(str(name) for name in file.attrs["marker_names"]),
+                *(file[key][()] for key in ("time", "position", "sigma", "state")),
+                **{
+                    key: {name: group[key][()] for name, group in cameras.items()}
+                    for key in ("pixel", "residual", "pixel_sigma")
+                },
+                fps=float(file.attrs["fps"]),
+                calibration=str(file.attrs["calibration"]),
+                sources={name: digest for digest, name in lines},
+                settings=str(file.attrs["settings"]),
+            )
+    except (OSError, KeyError, ValueError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"expected tracks written by rafl-track in {path}, which cannot be read: {reason}; track again"
+        ) from None
