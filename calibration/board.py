@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import cv2
 import numpy as np
@@ -11,7 +11,7 @@ from pydantic import Field, field_validator
 
 from groundwork import InputError, StrictModel, check_format, read_yaml
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 FORMAT = "rafl-board/1"
 FEWEST_POINTS = 8

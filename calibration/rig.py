@@ -80,9 +80,11 @@ def read_rig(path: Path) -> Rig:
 
 
 def _camera(entry: _CameraEntry) -> OrthographicCamera:
-    plane = entry.plane and Plane(
-        entry.plane.normal, 1e-3 * entry.plane.offset_mm, 1e-3 * entry.plane.sigma_mm
-    )
+    plane, covariance = None, None
+    if entry.plane is not None:
+        plane = Plane(entry.plane.normal, 1e-3 * entry.plane.offset_mm, 1e-3 * entry.plane.sigma_mm)
+    if entry.covariance is not None:
+        covariance = tuple(map(tuple, entry.covariance))
     mx, my = entry.pixels_per_mm
     return OrthographicCamera(
         entry.image_size,
@@ -94,7 +96,7 @@ def _camera(entry: _CameraEntry) -> OrthographicCamera:
         plane,
         entry.time_offset_s,
         entry.residual_px,
-        entry.covariance and tuple(map(tuple, entry.covariance)),
+        covariance,
     )
 
 

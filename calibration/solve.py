@@ -5,6 +5,7 @@ the scale, and the ratio of the two the cosine of the tilt. Bundle adjustment ov
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +17,7 @@ from calibration.camera import OrthographicCamera, Plane, centre_and_half_diagon
 from calibration.rig import PLANE_SIGMA_MM
 from groundwork import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 FEWEST_VIEWS = 4
 LEAST_TILT = np.radians(8.0)
@@ -48,7 +49,7 @@ def _affine(view: View) -> tuple[Array, Array]:
 def _tilt_and_rotation(matrix: Array, scale: float) -> tuple[float, Array]:
     """Tilt and one of the two mirror rotations of a view with A = `matrix`."""
     block = matrix / scale
-    block = block / max(1.0, np.linalg.norm(block, 2))
+    block = block / max(1.0, float(np.linalg.norm(block, 2)))
     singular = np.linalg.svd(block)[1]
     values, vectors = np.linalg.eigh(np.eye(2) - block.T @ block)
     depth = np.sqrt(max(values[1], 0.0)) * vectors[:, 1]  # third row of R, up to its sign
@@ -87,7 +88,7 @@ def solve_camera(name: str, views: list[View], image_size: tuple[int, int]) -> S
         here = WorldPose(origin_mm=(0, 0, 0), x_axis=(1, 0, 0), y_axis=(0, 1, 0))
         views = [View(v.name, v.points, v.pixels, here if v is views[0] else None) for v in views]
     affines = [_affine(view) for view in views]
-    scale = max(np.linalg.norm(matrix, 2) for matrix, _ in affines)
+    scale = float(np.max([np.linalg.norm(matrix, 2) for matrix, _ in affines]))
     tilts, rotations = zip(*(_tilt_and_rotation(matrix, scale) for matrix, _ in affines), strict=True)
     if sum(tilt > LEAST_TILT for tilt in tilts) < 3:
         raise InputError(

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -17,9 +17,8 @@ from capture.sources import Recorded, find_source, read_recorded
 from capture.specimen import Specimen
 from groundwork import InputError, StrictModel, require_file
 from rafl.dataset import Dataset, Trajectory
-from rafl.markers import Markers
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 FEWEST_MARKERS = 3
 SAME_STEP = 5e-3  # largest relative difference of time steps within a dataset
@@ -216,8 +215,8 @@ def _rigid_checked(pose: Array, layout: Array, tolerance: float, what: str) -> R
     if fit.residual > tolerance:
         raise InputError(
             f"{what}: expected the markers where the specimen's layout has them, found them "
-            f"{1e3 * float(fit.residual):.2f} mm off (root mean square; at most {1e3 * tolerance:g} mm); check "
-            "at_mm, the unit and the order, or allow it with --fit-tolerance-mm"
+            f"{1e3 * float(fit.residual):.2f} mm off (root mean square; at most {1e3 * tolerance:g} mm); "
+            "check at_mm, the unit and the order, or allow it with --fit-tolerance-mm"
         )
     return fit
 
@@ -250,8 +249,8 @@ def _registration(
     if rest_fit is not None:
         return rest_fit
     raise InputError(
-        f"recording {name}: expected a way to the specimen frame, found none; describe the clamp's markers in "
-        "the specimen (three or more, seen in every frame), or name an undeformed frame with --rest"
+        f"recording {name}: expected a way to the specimen frame, found none; describe the clamp's markers "
+        "in the specimen (three or more, seen in every frame), or name an undeformed frame with --rest"
     )
 
 
@@ -283,7 +282,7 @@ def _on_grid(
     grid[slot], grid_sigma[slot] = position, np.where(np.isfinite(sigma), sigma, np.inf)
     if np.isfinite(grid[0, :, 0]).sum() < FEWEST_MARKERS:
         raise InputError(
-            f"recording {row.recording}, frame {row.first_frame}: expected at least {FEWEST_MARKERS} markers, "
-            "found fewer; start at a later first_frame"
+            f"recording {row.recording}, frame {row.first_frame}: expected at least {FEWEST_MARKERS} markers"
+            ", found fewer; start at a later first_frame"
         )
     return step * np.arange(len(grid)), grid, grid_sigma

@@ -5,6 +5,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -24,7 +25,7 @@ from capture.render import Look, Painter, develop
 from capture.specimen import Specimen
 from groundwork import whole_file, write_text
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 IMAGE_SIZE = (1280, 720)
 MARGIN = 1.12  # picture over the space the motion sweeps
@@ -126,7 +127,8 @@ def write_board_images(folder: Path, rig: Rig, look: Look, random: np.random.Gen
     """
     world = {}
     smallest = min(camera.scale[0] for camera in rig.cameras.values())
-    squares = tuple(int(0.92 * size / smallest / (1e-3 * BOARD_MM[0])) for size in IMAGE_SIZE)
+    columns, rows = (int(0.92 * size / smallest / (1e-3 * BOARD_MM[0])) for size in IMAGE_SIZE)
+    squares = (columns, rows)
     pattern = CharucoPattern(
         kind="charuco", squares=squares, square_mm=BOARD_MM[0], marker_mm=BOARD_MM[1],
         dictionary="DICT_4X4_250",
@@ -181,7 +183,7 @@ def _board_picture(
     warp = np.column_stack([2 * to_pixels, 2 * shift + 0.5])
     width, height = camera.image_size
     large = cv2.warpAffine(
-        cv2.GaussianBlur(texture, (0, 0), 0.6 / (2 * np.linalg.norm(to_pixels, 2))),
+        cv2.GaussianBlur(texture, (0, 0), 0.6 / (2 * float(np.linalg.norm(to_pixels, 2)))),
         warp,
         (2 * width, 2 * height),
         flags=cv2.INTER_LINEAR,

@@ -1,18 +1,21 @@
 """The first frame: static equilibrium under virtual forces that puts the markers where they were seen."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from rafl.markers import Markers
-from rafl.simulator import Simulator
+from rafl.simulator import SimulationError, Simulator
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
-FORCE_SIGMA = 1.0  # prior standard deviation of a nodal force [N]
-LEAST_SIGMA = 2e-5  # markers are not pulled closer than this: the mesh is not the specimen [m]
+# Prior standard deviations of a nodal force [N]: of the part that varies linearly over the loaded
+# nodes (a pull and a moment), and of the rest, which would dent the mesh to please single markers.
+LINEAR_SIGMA, LOCAL_SIGMA = 1.0, 0.05
+LEAST_SIGMA = 5e-5  # markers are not pulled closer than this: the mesh is not the specimen [m]
 ITERATIONS = 30
 CONVERGED = 1e-6  # relative fall of the objective
 
@@ -37,7 +40,7 @@ def fit_first_frame(
 ) -> InitialState:
     """Virtual forces on some nodes such that the equilibrium's markers match the first frame.
 
-    Gauss-Newton on sum |x(q(f)) - target|^2 / sigma^2 + |f|^2, the Jacobian through the equilibrium
+    Gauss-Newton on sum |x(q(f)) - target|^2 / sigma^2 + f . C^-1 f, C the prior of the forces, the Jacobian through the equilibrium
     by the implicit-function theorem: dx/df = dx/dq K^-1.
 
     Args:
@@ -51,10 +54,11 @@ def fit_first_frame(
     Raises:
         SimulationError: an equilibrium could not be found.
     """
-    seen = np.isfinite(target).all(axis=1)
+    seen = np.isfinite(target[:, 0])
     wanted = target[seen].ravel()
     weight = 1.0 / np.maximum(sigma[seen], LEAST_SIGMA).ravel()
     force = np.zeros_like(simulator.mesh.vertices)
+    precision = _force_precision(simulator.mesh.vertices[nodes])
     where = f"{what}: first frame"
 
     def equilibrium(at: Array, start: Array | None) -> Array:
@@ -65,21 +69,25 @@ def fit_first_frame(
         return markers.positions(torch.from_numpy(q)).numpy()[seen].ravel() - wanted
 
     def objective(q: Array, at: Array) -> float:
-        return float(((weight * gap_of(q)) ** 2).sum() + ((at / FORCE_SIGMA) ** 2).sum())
+        return float(((weight * gap_of(q)) ** 2).sum() + (at[nodes] * (precision @ at[nodes])).sum())
 
     q = equilibrium(force, None)
     value = objective(q, force)
     for _ in range(ITERATIONS):
         jacobian = weight[:, None] * _marker_jacobian(simulator, markers, nodes, q, seen)
-        system = jacobian.T @ jacobian + np.eye(jacobian.shape[1]) / FORCE_SIGMA**2
-        right = jacobian.T @ (weight * gap_of(q)) + force[nodes].ravel() / FORCE_SIGMA**2
+        system = jacobian.T @ jacobian + np.kron(precision, np.eye(3))
+        right = jacobian.T @ (weight * gap_of(q)) + (precision @ force[nodes]).ravel()
         step = -np.linalg.solve(system, right).reshape(-1, 3)
         length = 1.0
         while length > 1e-3:
             trial = force.copy()
             trial[nodes] += length * step
-            trial_q = equilibrium(trial, q)
-            trial_value = objective(trial_q, trial)
+            try:
+                trial_q = equilibrium(trial, q)
+            except SimulationError:  # too far at once: a shorter step, and an error when none is short enough
+                trial_value = np.inf
+            else:
+                trial_value = objective(trial_q, trial)
             if trial_value < value:
                 break
             length *= 0.5
@@ -94,13 +102,22 @@ def fit_first_frame(
     return InitialState(q, force, residual)
 
 
+def _force_precision(places: Array) -> Array:
+    """Inverse prior covariance of one component of the forces on nodes at `places` (L, 3), (L, L)."""
+    modes = np.column_stack([np.ones(len(places)), (places - places.mean(0)) / np.ptp(places, axis=0).max()])
+    u, s, _ = np.linalg.svd(modes, full_matrices=False)
+    u = u[:, s > 1e-9 * s[0]]
+    linear = u @ u.T
+    return linear / LINEAR_SIGMA**2 + (np.eye(len(places)) - linear) / LOCAL_SIGMA**2
+
+
 def _marker_jacobian(
     simulator: Simulator, markers: Markers, nodes: NDArray[np.int64], q: Array, seen: NDArray[np.bool_]
 ) -> Array:
     """Derivative of the seen markers (3 M') by the forces on the nodes (3 L) [m/N]."""
     by_q = torch.autograd.functional.jacobian(markers.positions, torch.from_numpy(q), vectorize=True).numpy()
     rows = by_q[seen].reshape(-1, *q.shape)  # (3 M', N, 3)
-    batch = (np.full(1, value) for value in simulator.material.lame)
+    mu, lam = (np.full(1, value) for value in simulator.material.lame)
     columns = np.moveaxis(rows, 0, -1)[None]
-    solved = simulator.tangent_solve(q[None], *batch, np.zeros((1, len(q))), columns)[0]
+    solved = simulator.tangent_solve(simulator.tangent(q[None], mu, lam), np.zeros((1, len(q))), columns)[0]
     return np.moveaxis(solved[nodes], -1, 0).reshape(len(rows), -1)

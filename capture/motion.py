@@ -1,6 +1,7 @@
 """Simulated releases of a specimen: the motion that synthetic recordings show."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from rafl.material import Material
 from rafl.rollout import Start, rollout
 from rafl.simulator import GRAVITY, Simulator
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Pictures of a deformed, dotted, lit specimen as an orthographic camera sees it."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from calibration.camera import OrthographicCamera
 from capture.specimen import Specimen
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 LIGHT = np.array([-0.35, -0.25, 0.9]) / np.linalg.norm([-0.35, -0.25, 0.9])
 SKIN, DOT = 175.0, 35.0

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import ezc3d
 import numpy as np
@@ -10,7 +11,7 @@ from numpy.typing import NDArray
 from groundwork import InputError, sha256
 from tracking.tracks import MISSING, read_tracks
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 SUFFIXES = (".h5", ".c3d", ".npy")
 ASSUMED_SIGMA = 1e-4  # where a file has no uncertainty [m]

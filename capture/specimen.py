@@ -96,8 +96,8 @@ class Specimen:
             worst = int(np.argmax(off))
             raise InputError(
                 f"specimen {self.name}: marker {markers.names[worst]} at "
-                f"{np.round(1e3 * markers.rest[worst], 3).tolist()} mm lies {1e3 * off[worst]:.2f} mm off the "
-                f"surface, expected at most {1e3 * tolerance:g} mm; correct at_mm, or allow it "
+                f"{np.round(1e3 * markers.rest[worst], 3).tolist()} mm lies {1e3 * off[worst]:.2f} mm off "
+                f"the surface, expected at most {1e3 * tolerance:g} mm; correct at_mm, or allow it "
                 "with --tolerance-mm"
             )
         return markers

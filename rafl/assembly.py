@@ -152,3 +152,17 @@ def scatter_band(stiffness, hexes, unknown, band):  # type: ignore[no-untyped-de
                             band[r - c, c] += stiffness[e, 3 * a + i, 3 * b + k]
                         else:
                             band[c - r, r] += stiffness[e, 3 * a + i, 3 * b + k]
+
+
+@njit(cache=True)
+def multiply(stiffness, hexes, x, out):  # type: ignore[no-untyped-def]
+    """Add the cells' stiffnesses (E, 24, 24), given by their lower blocks, times x (N, 3) to out (N, 3)."""
+    for e in range(hexes.shape[0]):
+        for a in range(8):
+            for b in range(a + 1):
+                for i in range(3):
+                    for k in range(3):
+                        value = stiffness[e, 3 * a + i, 3 * b + k]
+                        out[hexes[e, a], i] += value * x[hexes[e, b], k]
+                        if a != b:
+                            out[hexes[e, b], k] += value * x[hexes[e, a], i]

@@ -135,8 +135,8 @@ def evaluate(
     write_report(folder / "report.html", comparisons, splits, recordings, described)
     table = Table("dataset", "split", "recordings", "method", "error [mm]")
     for row in splits.itertuples():
-        error = f"{row.mean_mm:.3f} +- {row.std_mm:.3f}"
-        table.add_row(row.dataset, row.split, str(row.recordings), row.method, error)
+        value = f"{row.mean_mm:.3f} +- {row.std_mm:.3f}"
+        table.add_row(str(row.dataset), str(row.split), str(row.recordings), str(row.method), value)
     Console(width=100).print(table)
     typer.echo(f"wrote {folder / 'errors.csv'}")
     held_out = held_out_errors(comparisons)

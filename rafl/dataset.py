@@ -3,6 +3,7 @@
 import datetime
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -16,7 +17,7 @@ from rafl.mesh import HexMesh
 from rafl.rollout import Start
 from rafl.simulator import Simulator
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 FORMAT = "rafl-dataset/1"
 SPLITS = ("train", "val", "test")
@@ -149,12 +150,13 @@ def read_dataset(path: Path) -> Dataset:
 
 def _read(file: h5py.File) -> Dataset:
     mesh = HexMesh(file["mesh/vertices"][()], file["mesh/hexes"][()])
+    gx, gy, gz = (float(g) for g in file.attrs["gravity"])
     simulator = Simulator(
         mesh,
         Material(**{key: _plain(value) for key, value in file["material"].attrs.items()}),
         file["mesh/fixed"][()],
         float(file.attrs["time_step"]),
-        tuple(float(g) for g in file.attrs["gravity"]),
+        (gx, gy, gz),
     )
     keys = ("rest", "quad", "weights", "normal_offset")
     names = tuple(name.decode() for name in file["markers/names"][()])
@@ -174,5 +176,5 @@ def _read(file: h5py.File) -> Dataset:
     return Dataset(str(file.attrs["name"]), simulator, markers, trajectories, str(file.attrs["recipe"]))
 
 
-def _plain(value: object) -> object:
+def _plain(value: Any) -> Any:
     return value.item() if isinstance(value, np.generic) else value

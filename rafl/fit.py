@@ -55,9 +55,9 @@ def training_recordings(datasets: list[Dataset]) -> tuple[list[Recordings], list
     """
     train = [Recordings.of(dataset, [name]) for dataset in datasets for name in dataset.split("train")]
     if not train:
-        names = ", ".join(dataset.name for dataset in datasets)
+        where = ", ".join(dataset.name for dataset in datasets)
         raise InputError(
-            f"expected recordings with split `train` in {names}, found none; set the split column of "
+            f"expected recordings with split `train` in {where}, found none; set the split column of "
             "recordings.csv and run rafl-capture again"
         )
     validate = [Recordings.of(dataset, names) for dataset in datasets if (names := dataset.split("val"))]
@@ -137,7 +137,7 @@ def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, r
                 )
             optimiser.step()
             losses.append(loss.item())
-        rate = schedule.get_last_lr()[0]
+        rate = float(schedule.get_last_lr()[0])
         schedule.step()
         error = 1e3 * mean_error(validate, model)
         best = min(row["validation_mm"] for row in history)

@@ -1,6 +1,7 @@
 """Markers on the skin: each rides on one boundary quad of the mesh (paper, observation operator x(s))."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -9,7 +10,7 @@ from torch import Tensor
 
 from rafl.mesh import HexMesh
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True)

@@ -1,21 +1,19 @@
 """What a specimen is made of."""
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rafl.mesh import HexMesh
 
-Number = TypeVar("Number")
 
-
-def lame(youngs_modulus: Number, poissons_ratio: Number) -> tuple[Number, Number]:
+def lame(youngs_modulus: Any, poissons_ratio: Any) -> tuple[Any, Any]:
     """Lame's mu and lambda [Pa] from E [Pa] and nu; floats, arrays and tensors alike."""
     e, nu = youngs_modulus, poissons_ratio
-    mu = e / (2.0 * (1.0 + nu))  # type: ignore[operator]
-    lam = e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))  # type: ignore[operator]
+    mu = e / (2.0 * (1.0 + nu))
+    lam = e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
     return mu, lam
 
 

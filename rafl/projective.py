@@ -26,9 +26,10 @@ def signed_svd(F, U, s, V):  # type: ignore[no-untyped-def]
                 a = B[0, p] * B[0, p] + B[1, p] * B[1, p] + B[2, p] * B[2, p]
                 b = B[0, r] * B[0, r] + B[1, r] * B[1, r] + B[2, r] * B[2, r]
                 c = B[0, p] * B[0, r] + B[1, p] * B[1, r] + B[2, p] * B[2, r]
-                if abs(c) <= 1e-17 * np.sqrt(a * b) or c == 0.0:
+                size = np.sqrt(a) * np.sqrt(b)
+                if abs(c) <= 1e-17 * size or size < 1e-150:
                     continue
-                off = max(off, abs(c) / np.sqrt(a * b))
+                off = max(off, abs(c) / size)
                 zeta = (b - a) / (2.0 * c)
                 t = (1.0 if zeta >= 0.0 else -1.0) / (abs(zeta) + np.sqrt(1.0 + zeta * zeta))
                 cos = 1.0 / np.sqrt(1.0 + t * t)

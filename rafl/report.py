@@ -38,7 +38,7 @@ Underlined: better than the original simulator. Bold: the best of its row.</p>
 <h2>Marker trajectories</h2>
 <p class="note">The marker that moves most, along the axis it moves most. Black: recorded.
 {% if left_out %}{{ left_out }} further recordings are in errors.csv only.{% endif %}</p>
-{% for image in marker_plots %}<img alt="marker trajectory" src="data:image/png;base64,{{ image }}">{% endfor %}
+{% for image in marker_plots %}<img alt="trajectory" src="data:image/png;base64,{{ image }}">{% endfor %}
 <h2>Every recording</h2>
 <table><tr><th>dataset</th><th>recording</th><th>split</th>
 {% for m in methods %}<th>{{ m }}</th>{% endfor %}</tr>

@@ -1,5 +1,6 @@
 """The residual acceleration field: a small network on local features (paper, RAFL section)."""
 
+import itertools
 from collections.abc import Sequence
 
 import torch
@@ -23,7 +24,7 @@ class ResidualField(nn.Module):
         super().__init__()
         sizes = [FEATURES, *[width] * layers]
         stack: list[nn.Module] = []
-        for before, after in zip(sizes[:-1], sizes[1:], strict=True):
+        for before, after in itertools.pairwise(sizes):
             stack += [nn.Linear(before, after, bias=False), nn.ELU()]
         stack.append(nn.Linear(width, 3, bias=False))
         self.network = nn.Sequential(*stack).to(torch.float64)

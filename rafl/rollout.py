@@ -38,10 +38,12 @@ class _Step(torch.autograd.Function):
         after, mu, lam = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
         simulator, dt = ctx.simulator, ctx.simulator.time_step
         inertia = ctx.mass / dt**2
-        adjoint = simulator.tangent_solve(after, mu, lam, inertia, grad.numpy())
+        tangent = simulator.tangent(after, mu, lam)
+        adjoint = simulator.tangent_solve(tangent, inertia, grad.numpy())
         by_target = inertia[:, :, None] * adjoint
         by_q = by_target.copy()
-        by_q[:, simulator.fixed] += grad.numpy()[:, simulator.fixed]
+        held = simulator.fixed
+        by_q[:, held] += (grad.numpy() - simulator.tangent_product(tangent, adjoint))[:, held]
         by_mu = by_lam = None
         if ctx.needs_input_grad[3] or ctx.needs_input_grad[4]:
             one, zero = np.ones(len(after)), np.zeros(len(after))

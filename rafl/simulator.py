@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,11 +11,11 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from threadpoolctl import ThreadpoolController
 
-from rafl.assembly import element_terms, scatter_band, scatter_gradient
+from rafl.assembly import element_terms, multiply, scatter_band, scatter_gradient
 from rafl.material import Material
 from rafl.mesh import HexMesh
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 GRAVITY = (0.0, 0.0, -9.80709)
 TOLERANCE = 1e-9  # largest nodal residual accepted [N]
@@ -216,10 +217,11 @@ class Simulator:
             if not done.all():
                 break
             energy, residual, stiffness = new_energy, new_residual, new_stiffness
-        worst = int(np.nanargmax(np.abs(residual).max(axis=1)))
+        largest = np.abs(residual).max(axis=1)
+        worst = int(np.argmax(np.where(np.isfinite(largest), largest, np.inf)))
         raise SimulationError(
             f"{what}: trajectory {active[worst]} did not converge (residual "
-            f"{np.abs(residual[worst]).max():.3g} N, wanted {TOLERANCE:.0e} N); "
+            f"{largest[worst]:.3g} N, wanted {TOLERANCE:.0e} N); "
             "try a smaller time step or load"
         )
 
@@ -258,19 +260,29 @@ class Simulator:
                 q = self.minimise(q, none, q, share * force, mu, lam, f"{what} at {share:.0%} of the load")
             return q
 
-    def tangent_solve(self, q: Array, mu: Array, lam: Array, inertia: Array, right: Array) -> Array:
-        """Solve (inertia + true tangent at q) x = right on the free nodes; zero on the held ones.
+    def tangent(self, q: Array, mu: Array, lam: Array) -> Array:
+        """The cells' true (unprojected) tangents at q, lower blocks only, (B, E, 24, 24) [N/m]."""
+        return self._terms(q, mu, lam, project=False, tangent=True)[2]
 
-        q (B, N, 3), inertia (B, N), right (B, N, 3) or, with further columns, (B, N, 3, C).
+    def tangent_product(self, tangent: Array, x: Array) -> Array:
+        """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
+        out = np.zeros_like(x)
+        for t in range(len(x)):
+            multiply(tangent[t], self.mesh.hexes, x[t], out[t])
+        return out
+
+    def tangent_solve(self, tangent: Array, inertia: Array, right: Array) -> Array:
+        """Solve (inertia + tangent) x = right on the free nodes; zero on the held ones.
+
+        tangent from `tangent`, inertia (B, N), right (B, N, 3) or, with further columns, (B, N, 3, C).
         """
-        stiffness = self._terms(q, mu, lam, project=False, tangent=True)[2]
         columns = right.reshape(*right.shape[:3], -1)
         out = np.zeros_like(columns)
         free = self.free_index
         with _BLAS.limit(limits=1, user_api="blas"):
-            for t in range(len(q)):
+            for t in range(len(right)):
                 load = columns[t].reshape(-1, columns.shape[-1])[free]
-                band = self._band(stiffness[t], inertia[t])
+                band = self._band(tangent[t], inertia[t])
                 factor, info = lapack.dpbtrf(band, lower=1)
                 if info == 0:
                     solution = lapack.dpbtrs(factor, load, lower=1)[0]

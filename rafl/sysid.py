@@ -61,10 +61,16 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
     assumed = datasets[0].simulator.material
     start = np.array([np.log(assumed.youngs_modulus), min(assumed.poissons_ratio, POISSON[1])])
     record(start)
+
     # Tenths of nu and of log E are of like effect; L-BFGS-B wants its variables so.
     scale = np.array([1.0, 0.1])
+
+    def scaled(y: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = objective(y * scale)
+        return value, slope * scale
+
     result = minimize(
-        lambda y: (lambda f, g: (f, g * scale))(*objective(y * scale)),
+        scaled,
         start / scale,
         jac=True,
         method="L-BFGS-B",

@@ -1,13 +1,14 @@
 """Finding dots in a picture and fitting a soft-edged disc to each."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 RADII = (3.0, 20.0)  # of the dots looked for [px]
 FLATTEST = 0.4  # least ratio of the axes
@@ -105,7 +106,7 @@ def _fit_disc(image, p, reach, dots_near, out):  # type: ignore[no-untyped-def]
     top, bottom = max(int(y0 - window), 0), min(int(y0 + window) + 2, height)
     a0, b0, c0 = p[2], p[3], p[4]
     count = 0
-    step = np.zeros(n)
+    step = p * 0.0
     for iteration in range(40):
         cost = 0.0
         count = 0
@@ -213,7 +214,7 @@ def candidates(image: NDArray[np.uint8], dark: bool) -> Array:
 
 
 def _blobs(image: NDArray[np.uint8], mask: NDArray[np.uint8], scale: float) -> list[Array]:
-    count, labels, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    _, labels, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=4)
     low, high = max(RADII[0], 0.6 * scale) - 1.0, min(RADII[1], 1.7 * scale) + 1.0
     area = stats[:, cv2.CC_STAT_AREA]
     width, height = stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +14,7 @@ from groundwork import InputError
 from tracking.dots import LEAST_CONTRAST, Dots, find_dots, refine
 from tracking.video import Video
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 FEWEST_MARKERS = 3
 NEIGHBOURS = 6

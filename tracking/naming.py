@@ -1,5 +1,7 @@
 """Which dot is which marker of the layout."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
@@ -8,7 +10,7 @@ from calibration.camera import OrthographicCamera
 from groundwork import InputError
 from tracking.layout import MarkerLayout
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 NEAR = 0.4  # of the local spacing: how far a dot may be from where its neighbours put it
 TURNS = np.radians(np.concatenate([[0], np.repeat(np.arange(15, 181, 15), 2) * np.tile([1, -1], 12)]))

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from tracking.reconstruct import CameraPixels, fill_gaps, on_rig_clock, triangul
 from tracking.tracks import MEASURED, Tracks
 from tracking.video import Video
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -112,8 +113,8 @@ def _time(
         if late.max() > 0.5 * step:
             raise InputError(
                 f"{videos[camera].path}: expected the frame times of the other camera, found frame "
-                f"{int(np.argmax(late > 0.5 * step))} {1e3 * late.max():.1f} ms apart; record both cameras at "
-                "one rate, or give the true rate with --fps"
+                f"{int(np.argmax(late > 0.5 * step))} {1e3 * late.max():.1f} ms apart; record both cameras "
+                "at one rate, or give the true rate with --fps"
             )
     return first
 

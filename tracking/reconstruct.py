@@ -1,6 +1,8 @@
 """From pixels of calibrated cameras to 3-D positions with their uncertainty."""
 
+import itertools
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +11,7 @@ from scipy.interpolate import CubicSpline
 from calibration.rig import Rig
 from groundwork import InputError
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -115,7 +117,7 @@ def fill_gaps(
         if len(seen) < 4 or longest == 0:
             continue
         spline = CubicSpline(time[seen], position[seen, marker])
-        for before, after in zip(seen[:-1], seen[1:], strict=True):
+        for before, after in itertools.pairwise(seen):
             if not 1 < after - before <= longest + 1:
                 continue
             gap = np.arange(before + 1, after)

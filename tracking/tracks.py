@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -9,7 +10,7 @@ from numpy.typing import NDArray
 
 from groundwork import VERSION, InputError, check_format, require_file, whole_file
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 
 FORMAT = "rafl-tracks/1"
 MISSING, MEASURED, FILLED = 0, 1, 2
@@ -82,13 +83,19 @@ def read_tracks(path: Path) -> Tracks:
             check_format(str(file.attrs.get("format", "")), FORMAT, path)
             cameras = file.get("cameras", {})
             lines = [str(line).split("  ", 1) for line in file.attrs["sources"]]
+            of_camera = {
+                key: {name: group[key][()] for name, group in cameras.items()}
+                for key in ("pixel", "residual", "pixel_sigma")
+            }
             return Tracks(
-                tuple(str(name) for name in file.attrs["marker_names"]),
-                *(file[key][()] for key in ("time", "position", "sigma", "state")),
-                **{
-                    key: {name: group[key][()] for name, group in cameras.items()}
-                    for key in ("pixel", "residual", "pixel_sigma")
-                },
+                names=tuple(str(name) for name in file.attrs["marker_names"]),
+                time=file["time"][()],
+                position=file["position"][()],
+                sigma=file["sigma"][()],
+                state=file["state"][()],
+                pixel=of_camera["pixel"],
+                residual=of_camera["residual"],
+                pixel_sigma=of_camera["pixel_sigma"],
                 fps=float(file.attrs["fps"]),
                 calibration=str(file.attrs["calibration"]),
                 sources={name: digest for digest, name in lines},

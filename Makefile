@@ -1,0 +1,48 @@
+# `make demo` and `make test` are all a fresh machine needs; both set up .venv first.
+VENV := .venv
+BIN := $(VENV)/bin
+DEMO := build/demo
+SHARED ?= ../shared
+# BLAS threads fight the simulator's own.
+export OPENBLAS_NUM_THREADS := 1
+
+.PHONY: install demo test lint slow real real-beam clean
+
+install: $(VENV)/installed
+
+$(VENV)/installed: pyproject.toml constraints.txt
+	python3 -m venv $(VENV) || (echo "the venv module is missing: apt-get install python3-venv" && false)
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+# From a simulated specimen on film to a fitted model, by the commands a lab types.
+demo: install
+	rm -rf $(DEMO)
+	$(BIN)/rafl-render datasets/specimens/canonical.yaml --out $(DEMO) --frames 80
+	$(BIN)/rafl-calibrate $(DEMO)/calibration --out $(DEMO)/calib.yaml
+	$(BIN)/rafl-track $(DEMO)/videos --calib $(DEMO)/calib.yaml --specimen datasets/specimens/canonical.yaml --out $(DEMO)/tracks
+	$(BIN)/rafl-capture datasets/specimens/canonical.yaml $(DEMO)/tracks --recordings $(DEMO)/recordings.csv --out $(DEMO)/canonical.h5
+	$(BIN)/rafl-fit $(DEMO)/canonical.h5 --out $(DEMO)/run --epochs 12
+	$(BIN)/rafl-eval $(DEMO)/run $(DEMO)/canonical.h5
+
+test: install lint
+	$(BIN)/pytest
+
+lint: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+slow: install
+	$(BIN)/pytest -m slow
+
+# What needs the recordings and trajectories beside the checkout; skipped where they are absent.
+real: install
+	SHARED=$(SHARED) $(BIN)/pytest -m "real or reference" -rs
+
+# The real beam, each recording held out in turn: original, SysID, RAFL.
+real-beam: install
+	$(BIN)/python tests/bench/clamped_beam.py $(SHARED)/real/clamped_beam --out build/clamped_beam
+
+clean:
+	rm -rf build $(VENV)

@@ -1,0 +1,77 @@
+"""Specimens, datasets and recordings that several tests start from."""
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from capture.specimen import Specimen, read_specimen
+
+ROOT = Path(__file__).parent.parent
+SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared"))
+
+SMALL = """format: rafl-specimen/1
+name: small
+geometry: {box_mm: [60, 20, 20], element_mm: 10}
+material: {youngs_modulus: 150000, poissons_ratio: 0.4, density: 1070, mass: lumped}
+clamp: {face: x-min}
+markers:
+"""
+
+
+def small_specimen_text() -> str:
+    entries = [
+        f"  - {{name: {side}{row}{column}, at_mm: [{x}, {y}, {z}]}}"
+        for side, y in (("L", 0), ("R", 20))
+        for row, z in (("a", 13), ("b", 7))
+        for column, x in enumerate((8, 18, 28, 38, 52))
+    ]
+    return SMALL + "\n".join(entries) + "\n"
+
+
+@pytest.fixture
+def specimen_file(tmp_path: Path) -> Path:
+    path = tmp_path / "small.yaml"
+    path.write_text(small_specimen_text())
+    return path
+
+
+@pytest.fixture(scope="session")
+def small_specimen(tmp_path_factory: pytest.TempPathFactory) -> Specimen:
+    path = tmp_path_factory.mktemp("specimen") / "small.yaml"
+    path.write_text(small_specimen_text())
+    return read_specimen(path)
+
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Run:
+    """Run a console script in a temporary folder, as a stranger would."""
+
+    def command(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
+        script = Path(sys.executable).parent / name
+        line = [str(script), *map(str, arguments)]
+        return subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600)
+
+    return command
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> None:
+    """One line on standard error that names all parts, exit code 2, no traceback."""
+    assert result.returncode == 2, result.stdout + result.stderr
+    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("error: ")
+    for part in parts:
+        assert part in lines[0], (part, lines[0])
+
+
+@pytest.fixture
+def random() -> np.random.Generator:
+    return np.random.default_rng(7)

@@ -1,0 +1,133 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from rafl.features import GaussPoints, _PolarStretch, features
+from rafl.material import Material
+from rafl.mesh import HexMesh
+from rafl.residual import ResidualField
+from rafl.simulator import Simulator
+
+G = torch.tensor([0.0, 0.0, -9.8], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def mesh() -> HexMesh:
+    return HexMesh.box((2, 2, 1), (0.04, 0.02, 0.02))
+
+
+@pytest.fixture(scope="module")
+def field(mesh: HexMesh) -> tuple[ResidualField, Simulator]:
+    torch.manual_seed(3)
+    return ResidualField(), Simulator(mesh, Material(), mesh.face_nodes("x-min"))
+
+
+@pytest.mark.parametrize(
+    "F",
+    [np.eye(3), np.diag([1.2, 1.2, 0.9]), np.diag([1.3, 0.9, 0.2])],
+    ids=["rest", "repeated", "thin"],
+)
+def test_polar_backward_by_finite_differences(F: np.ndarray, random: np.random.Generator) -> None:
+    """R, and the sum of squares of the stretches, which is smooth where they cross."""
+    at = torch.tensor(Rotation.from_rotvec([0.3, 0.2, -0.5]).as_matrix() @ F)[None].requires_grad_()
+    weights = torch.tensor(random.normal(size=(3, 3)))
+
+    def value(F: torch.Tensor) -> torch.Tensor:
+        R, s = _PolarStretch.apply(F)
+        return (R * weights).sum() + (s**2).sum()
+
+    assert torch.autograd.gradcheck(value, (at,), eps=1e-6, atol=1e-6)
+
+
+def test_features_and_gradients_are_finite_at_exact_rest(mesh: HexMesh) -> None:
+    q = torch.tensor(mesh.vertices[None]).requires_grad_()
+    v = torch.zeros_like(q).requires_grad_()
+    values, _ = features(q, v, GaussPoints.of(mesh, 1070.0), G)
+    values.square().sum().backward()
+    assert torch.isfinite(values).all()
+    assert torch.isfinite(q.grad).all()
+    assert torch.isfinite(v.grad).all()
+    assert values[..., :31].abs().max() < 1e-9
+
+
+def test_features_of_a_known_motion(mesh: HexMesh) -> None:
+    """q = A x with A = R diag(1.1, 0.9, 1), v = B q: F = A, L = B everywhere."""
+    R = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
+    A = R @ np.diag([1.1, 0.9, 1.0])
+    B = np.array([[0.1, 0.4, 0.0], [-0.2, 0.3, 0.5], [0.1, 0.0, -0.6]])
+    q = mesh.vertices @ A.T
+    values, rotation = features(
+        torch.tensor(q[None]), torch.tensor((q @ B.T)[None]), GaussPoints.of(mesh, 1070.0), G
+    )
+    np.testing.assert_allclose(rotation[0, 0, 0].numpy(), R, atol=1e-13)
+    one = values[0, 1, 5].numpy()
+    local = R.T @ B @ R
+    D, W = 0.5 * (local + local.T), 0.5 * (local - local.T)
+    dev = D - np.trace(D) / 3 * np.eye(3)
+    axial = np.array([W[2, 1], W[0, 2], W[1, 0]])
+    expected = np.concatenate(
+        [
+            [-0.1, 0.0, 0.1], (A.T @ A - np.eye(3)).ravel(), [0.99 - 1.0], np.diag(D), [np.trace(D)],
+            dev.ravel(), [np.sqrt(0.5 * (dev**2).sum())], axial, [2 * np.linalg.norm(axial)],
+            R.T @ G.numpy(),
+        ]
+    )  # fmt: skip
+    np.testing.assert_allclose(one, expected, atol=1e-12)
+
+
+def test_force_turns_with_the_body(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
+    model, simulator = field
+    turn = torch.tensor(Rotation.from_rotvec([0.2, 1.0, -0.4]).as_matrix())
+    q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
+    v = torch.tensor(random.normal(0, 0.2, q.shape))
+    turned = Simulator(
+        simulator.mesh, simulator.material, simulator.fixed, gravity=tuple((turn @ torch.tensor(simulator.gravity, dtype=torch.float64)).tolist())
+    )  # fmt: skip
+    force = model.on(simulator)(q, v)
+    torch.testing.assert_close(model.on(turned)(q @ turn.T, v @ turn.T), force @ turn.T, atol=1e-12, rtol=1e-9)
+
+
+def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
+    model, simulator = field
+    q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
+    v = torch.tensor(random.normal(0, 0.2, q.shape))
+    force = model.on(simulator)
+    c, dq, dv = (torch.tensor(random.normal(size=q.shape)) for _ in range(3))
+    q.requires_grad_()
+    v.requires_grad_()
+    (force(q, v) * c).sum().backward()
+    h = 1e-6
+    with torch.no_grad():
+        slope = ((force(q + h * dq, v + h * dv) - force(q - h * dq, v - h * dv)) * c).sum() / (2 * h)
+    assert q.grad is not None
+    assert v.grad is not None
+    assert float((q.grad * dq + v.grad * dv).sum()) == pytest.approx(float(slope), rel=1e-5)
+
+
+def test_weights_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
+    model, simulator = field
+    q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
+    v = torch.tensor(random.normal(0, 0.2, q.shape))
+    c = torch.tensor(random.normal(size=q.shape))
+    model.zero_grad()
+    (model.on(simulator)(q, v) * c).sum().backward()
+    for weight in model.parameters():
+        direction = torch.tensor(random.normal(size=weight.shape))
+        assert weight.grad is not None
+        gradient = float((weight.grad * direction).sum())
+        with torch.no_grad():
+            values = []
+            for sign in (1, -1):
+                weight += sign * 1e-6 * direction
+                values.append(float((model.on(simulator)(q, v) * c).sum()))
+                weight -= sign * 1e-6 * direction
+        assert gradient == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-5)
+
+
+def test_a_uniform_acceleration_weighs_the_body(mesh: HexMesh) -> None:
+    """Accumulating the same acceleration everywhere gives total force = mass * acceleration."""
+    points = GaussPoints.of(mesh, 1000.0)
+    acceleration = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).expand(1, len(mesh.hexes), 8, 3)
+    force = points.accumulate(acceleration, len(mesh.vertices))
+    np.testing.assert_allclose(force[0].sum(0).numpy(), 0.016 * np.array([1.0, 2.0, 3.0]))

@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+
+from rafl.material import Material, lame
+from rafl.mesh import HexMesh
+
+
+def skewed() -> HexMesh:
+    """A sheared and tapered block: no cell is a box."""
+    mesh = HexMesh.box((3, 2, 2), (0.3, 0.2, 0.2))
+    x, y, z = mesh.vertices.T
+    return HexMesh(np.stack([x + 0.2 * z, y * (1 + 0.5 * x), z + 0.1 * x * y], axis=1), mesh.hexes)
+
+
+def test_volume_of_a_tapered_block() -> None:
+    """y scaled by 1 + x / 2, the rest shear: volume = 0.04 * integral of 1 + x / 2 over 0..0.3.
+
+    The z term adds 0.1 x y to z: its Jacobian is unit to the order that changes volume, except
+    through x + 0.2 z; det = (1 + x/2) - 0.2 * 0.1 * (y + ...) is integrated here by many points.
+    """
+    n = 60
+    grid = (np.arange(n) + 0.5) / n
+    x, y, z = np.meshgrid(0.3 * grid, 0.2 * grid, 0.2 * grid, indexing="ij")
+    jacobian = np.zeros((*x.shape, 3, 3))
+    jacobian[..., 0, 0], jacobian[..., 0, 2] = 1.0, 0.2
+    jacobian[..., 1, 0], jacobian[..., 1, 1] = 0.5 * y, 1 + 0.5 * x
+    jacobian[..., 2, 0], jacobian[..., 2, 1], jacobian[..., 2, 2] = 0.1 * y, 0.1 * x, 1.0
+    exact = np.linalg.det(jacobian).mean() * 0.3 * 0.2 * 0.2
+    coarse = skewed().volumes.sum()
+    assert coarse == pytest.approx(exact, rel=2e-3)
+
+
+def test_gradients_reproduce_linear_fields() -> None:
+    """On any cell shape the gradient of A x + b is A."""
+    mesh = skewed()
+    a = np.array([[1.0, 2.0, -1.0], [0.3, -0.7, 0.2], [2.0, 0.1, 1.5]])
+    field = mesh.vertices @ a.T + 3.0
+    gradient = np.einsum("eni,egnj->egij", field[mesh.hexes], mesh.quadrature.gradient)
+    np.testing.assert_allclose(gradient, np.broadcast_to(a, gradient.shape), atol=1e-12)
+
+
+def test_an_inverted_cell_is_refused_by_index() -> None:
+    mesh = HexMesh.box((3, 1, 1), (3.0, 1.0, 1.0))
+    vertices = mesh.vertices.copy()
+    vertices[mesh.hexes[1][4:]] -= [1.5, 0, 0]
+    with pytest.raises(ValueError, match="cell 1 is inverted"):
+        _ = HexMesh(vertices, mesh.hexes).quadrature
+
+
+def test_surface_is_closed_and_points_outwards() -> None:
+    """Area vectors of a closed surface add up to zero; x . n / 3 over it is the volume."""
+    mesh = HexMesh.box((3, 2, 2), (0.3, 0.2, 0.1))
+    corners = mesh.vertices[mesh.surface]
+    area = 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    np.testing.assert_allclose(area.sum(0), 0.0, atol=1e-15)
+    assert (area * corners.mean(1)).sum() / 3.0 == pytest.approx(0.006)
+    assert len(mesh.surface) == 2 * (3 * 2 + 3 * 2 + 2 * 2)
+
+
+def test_face_nodes() -> None:
+    mesh = HexMesh.box((4, 2, 3), (0.4, 0.2, 0.3))
+    assert len(mesh.face_nodes("x-min")) == 12
+    assert (mesh.vertices[mesh.face_nodes("z-max"), 2] == pytest.approx(0.3)) is True
+    with pytest.raises(ValueError, match="x-min"):
+        mesh.face_nodes("left")
+
+
+def test_masses() -> None:
+    """Lumped mass is the true one; the paper's gives every node a whole cell's."""
+    mesh = HexMesh.box((10, 3, 3), (0.1, 0.03, 0.03))
+    assert Material(mass="lumped").node_mass(mesh).sum() == pytest.approx(1070 * 9e-5)
+    assert Material(mass="uniform").node_mass(mesh).sum() == pytest.approx(0.18832)
+
+
+def test_lame() -> None:
+    mu, lam = lame(2.5, 0.25)
+    assert mu == pytest.approx(1.0)
+    assert lam == pytest.approx(1.0)

@@ -1,0 +1,63 @@
+from pathlib import Path
+
+import pytest
+
+from groundwork import InputError, StrictModel, check_format, read_yaml, sha256, whole_file
+
+
+class Thing(StrictModel):
+    length_mm: float
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "a.txt"
+    path.write_text("old")
+    with pytest.raises(RuntimeError), whole_file(path) as temporary:
+        temporary.write_text("half")
+        raise RuntimeError
+    assert path.read_text() == "old"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_whole_write_replaces_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "a.txt"
+    with whole_file(path) as temporary:
+        temporary.write_text("new")
+        assert not path.exists()
+    assert path.read_text() == "new"
+    assert path.stat().st_mode & 0o044
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("length_mm: [", "not readable as YAML"),
+        ("- 1", "found list"),
+        ("length_m: 3", "length_mm: Field required"),
+        ("length_mm: long", "found 'long'"),
+        ("{length_mm: 1, width: 2}", "width"),
+    ],
+)
+def test_yaml_errors_name_file_and_key(tmp_path: Path, text: str, part: str) -> None:
+    path = tmp_path / "thing.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=r"thing\.yaml") as error:
+        read_yaml(path, Thing, "a thing")
+    assert part in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_formats(tmp_path: Path) -> None:
+    check_format("rafl-thing/1", "rafl-thing/2", tmp_path)
+    with pytest.raises(InputError, match="newer"):
+        check_format("rafl-thing/3", "rafl-thing/2", tmp_path)
+    for other in ("rafl-other/1", "", "rafl-thing/x"):
+        with pytest.raises(InputError, match="right file"):
+            check_format(other, "rafl-thing/2", tmp_path)
+
+
+def test_hash_of_a_known_text(tmp_path: Path) -> None:
+    (tmp_path / "a").write_text("abc")
+    known = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
+    assert sha256(tmp_path / "a") == known
+    assert sha256(tmp_path) == known
