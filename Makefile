@@ -22,7 +22,7 @@ demo: install
 	$(BIN)/rafl-calibrate $(DEMO)/calibration --out $(DEMO)/calib.yaml
 	$(BIN)/rafl-track $(DEMO)/videos --calib $(DEMO)/calib.yaml --specimen datasets/specimens/canonical.yaml --out $(DEMO)/tracks
 	$(BIN)/rafl-capture datasets/specimens/canonical.yaml $(DEMO)/tracks --recordings $(DEMO)/recordings.csv --out $(DEMO)/canonical.h5
-	$(BIN)/rafl-fit $(DEMO)/canonical.h5 --out $(DEMO)/run --epochs 12
+	$(BIN)/rafl-fit $(DEMO)/canonical.h5 --out $(DEMO)/run --epochs 16
 	$(BIN)/rafl-eval $(DEMO)/run $(DEMO)/canonical.h5
 
 test: install lint

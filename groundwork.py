@@ -149,9 +149,7 @@ def check_format(found: str, expected: str, path: Path) -> None:
     if found_name != name or not found_version.isdigit():
         raise InputError(f"expected format {expected} in {path}, found {found!r}; is it the right file?")
     if int(found_version) > int(version):
-        raise InputError(
-            f"{path} has format {found}, newer than this program's {expected}; install a newer version"
-        )
+        raise InputError(f"{path} has format {found}, newer than this program's {expected}; install a newer version")
 
 
 def sha256(path: Path) -> str:

@@ -57,9 +57,7 @@ def _pictures(images: Path) -> dict[str, dict[str, Path]]:
     folders = sorted(path for path in images.iterdir() if path.is_dir())
     found = {
         folder.name: {
-            f"{folder.name}/{path.name}": path
-            for path in sorted(folder.iterdir())
-            if path.suffix.lower() in PICTURES
+            f"{folder.name}/{path.name}": path for path in sorted(folder.iterdir()) if path.suffix.lower() in PICTURES
         }
         for folder in folders or [images]
     }

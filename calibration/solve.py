@@ -122,9 +122,7 @@ def solve_camera(name: str, views: list[View], image_size: tuple[int, int]) -> S
             ideals.append((views[index], views[index].points @ board.T + own[3:]))
         return [distort(ideal, (x[8], x[9]), centre, half) - view.pixels for view, ideal in ideals]
 
-    result = least_squares(
-        lambda x: np.concatenate(gaps(x)).ravel(), start, x_scale="jac", loss="huber", f_scale=0.5
-    )
+    result = least_squares(lambda x: np.concatenate(gaps(x)).ravel(), start, x_scale="jac", loss="huber", f_scale=0.5)
     final = gaps(result.x)
     flat = np.concatenate(final)
     residual = float(np.sqrt((flat**2).sum(1).mean() / 2))

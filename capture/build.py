@@ -80,13 +80,9 @@ def read_recording_rows(path: Path) -> list[RecordingRow]:
             raise InputError(f"{path} line {line}, column {column}: {first['msg']}; correct it") from None
     if not rows:
         raise InputError(f"expected at least one recording in {path}, found none; add a row")
-    twice = [
-        name for name, count in pd.Series([row.recording for row in rows]).value_counts().items() if count > 1
-    ]
+    twice = [name for name, count in pd.Series([row.recording for row in rows]).value_counts().items() if count > 1]
     if twice:
-        raise InputError(
-            f"{path}: expected each recording once, {twice[0]} stands there twice; remove one row"
-        )
+        raise InputError(f"{path}: expected each recording once, {twice[0]} stands there twice; remove one row")
     if not any(row.split == "train" for row in rows):
         raise InputError(f"{path}: expected a recording with split `train`, found none; set one")
     return rows
@@ -112,9 +108,7 @@ def build_dataset(
     """
     markers = specimen.markers(settings.tolerance)
     sources = {row.recording: find_source(folder, row.recording) for row in rows}
-    read = {
-        name: _selected(read_recorded(path, settings.fps), specimen, name) for name, path in sources.items()
-    }
+    read = {name: _selected(read_recorded(path, settings.fps), specimen, name) for name, path in sources.items()}
     clamp = specimen.clamp_layout.positions
     if settings.rest is not None:
         clamp, rest_fit = _measured_clamp(read, specimen, settings)
@@ -187,9 +181,7 @@ def _selected(item: Recorded, specimen: Specimen, name: str) -> Recorded:
     return Recorded(wanted, item.time, position, sigma, item.rest, item.in_specimen_frame, item.source)
 
 
-def _measured_clamp(
-    read: dict[str, Recorded], specimen: Specimen, settings: CaptureSettings
-) -> tuple[Array, Rigid]:
+def _measured_clamp(read: dict[str, Recorded], specimen: Specimen, settings: CaptureSettings) -> tuple[Array, Rigid]:
     """Clamp marker positions as found where the specimen is undeformed, and the fit that shows them."""
     assert settings.rest is not None
     name, frame = settings.rest
@@ -254,9 +246,7 @@ def _registration(
     )
 
 
-def _on_grid(
-    item: Recorded, rigid: Rigid, skin: int, step: float, row: RecordingRow
-) -> tuple[Array, Array, Array]:
+def _on_grid(item: Recorded, rigid: Rigid, skin: int, step: float, row: RecordingRow) -> tuple[Array, Array, Array]:
     """Times, skin markers and sigma of the chosen frames on an even grid; dropped frames are gaps."""
     last = len(item.time) - 1 if row.last_frame is None else row.last_frame
     if not row.first_frame < last < len(item.time):

@@ -125,21 +125,13 @@ def _splits(motions: list[Motion]) -> str:
 @user_command
 def capture(
     specimen: Annotated[Path, typer.Argument(help="Specimen description (specimen.yaml).")],
-    tracks: Annotated[
-        Path, typer.Argument(help="Folder of tracks (.h5), motion capture (.c3d) or q<i>.npy.")
-    ],
+    tracks: Annotated[Path, typer.Argument(help="Folder of tracks (.h5), motion capture (.c3d) or q<i>.npy.")],
     recordings: Annotated[Path, typer.Option(help="Table of recordings: recording,load_g,split.")],
     out: Annotated[Path | None, typer.Option(help="Dataset to write [datasets/<specimen>.h5].")] = None,
-    tolerance_mm: Annotated[
-        float, typer.Option(min=0.0, help="Markers may stand this far off the skin.")
-    ] = 2.0,
+    tolerance_mm: Annotated[float, typer.Option(min=0.0, help="Markers may stand this far off the skin.")] = 2.0,
     fit_tolerance_mm: Annotated[float, typer.Option(min=0.0, help="Registration may be this far off.")] = 3.0,
-    rest: Annotated[
-        str | None, typer.Option(help="RECORDING:FRAME in which the specimen is undeformed.")
-    ] = None,
-    moving_clamp: Annotated[
-        bool, typer.Option(help="Follow the clamp's markers, where there are some.")
-    ] = True,
+    rest: Annotated[str | None, typer.Option(help="RECORDING:FRAME in which the specimen is undeformed.")] = None,
+    moving_clamp: Annotated[bool, typer.Option(help="Follow the clamp's markers, where there are some.")] = True,
     fps: Annotated[float, typer.Option(min=0.1, help="Frames per second of npy files.")] = 100.0,
 ) -> None:
     """Register recordings to the specimen, tie the markers to its mesh, and fit each first frame.
@@ -148,9 +140,7 @@ def capture(
     """
     described = read_specimen(specimen)
     rows = read_recording_rows(recordings)
-    settings = CaptureSettings(
-        1e-3 * tolerance_mm, 1e-3 * fit_tolerance_mm, fps, _rest_frame(rest), moving_clamp
-    )
+    settings = CaptureSettings(1e-3 * tolerance_mm, 1e-3 * fit_tolerance_mm, fps, _rest_frame(rest), moving_clamp)
     path = out or Path("datasets") / f"{described.name}.h5"
     recipe = f"{described.text}\n# recordings.csv\n{recordings.read_text(encoding='utf-8')}"
     with progress() as bar:

@@ -196,9 +196,7 @@ def write_truth(path: Path, specimen: Specimen, motions: list[Motion], rig: Rig,
     """`truth.h5`: per recording time, marker positions [m], their pixels by camera, and the mesh."""
     markers = specimen.markers(np.inf)
     with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(
-            {"calibration": rig_text(rig), "material": material_text, "specimen": specimen.text}
-        )
+        file.attrs.update({"calibration": rig_text(rig), "material": material_text, "specimen": specimen.text})
         file["marker_names"] = np.array(markers.names, dtype=h5py.string_dtype())
         for motion in motions:
             group = file.create_group(motion.name)

@@ -16,7 +16,7 @@ Array = NDArray[Any]
 # nodes (a pull and a moment), and of the rest, which would dent the mesh to please single markers.
 LINEAR_SIGMA, LOCAL_SIGMA = 1.0, 0.05
 LEAST_SIGMA = 5e-5  # markers are not pulled closer than this: the mesh is not the specimen [m]
-ITERATIONS = 30
+FIRST_DAMPING, LAST_DAMPING = 1e2, 1e8  # of a step, as a multiple of the prior
 CONVERGED = 1e-6  # relative fall of the objective
 
 
@@ -40,8 +40,8 @@ def fit_first_frame(
 ) -> InitialState:
     """Virtual forces on some nodes such that the equilibrium's markers match the first frame.
 
-    Gauss-Newton on sum |x(q(f)) - target|^2 / sigma^2 + f . C^-1 f, C the prior of the forces, the Jacobian through the equilibrium
-    by the implicit-function theorem: dx/df = dx/dq K^-1.
+    Levenberg-Marquardt on sum |x(q(f)) - target|^2 / sigma^2 + f . C^-1 f with C the prior of the forces;
+    the Jacobian through the equilibrium is the implicit-function theorem's, dx/df = dx/dq K^-1.
 
     Args:
         simulator: of the specimen.
@@ -73,29 +73,27 @@ def fit_first_frame(
 
     q = equilibrium(force, None)
     value = objective(q, force)
-    for _ in range(ITERATIONS):
+    damping = FIRST_DAMPING
+    prior = np.kron(precision, np.eye(3))
+    while True:
         jacobian = weight[:, None] * _marker_jacobian(simulator, markers, nodes, q, seen)
-        system = jacobian.T @ jacobian + np.kron(precision, np.eye(3))
-        right = jacobian.T @ (weight * gap_of(q)) + (precision @ force[nodes]).ravel()
-        step = -np.linalg.solve(system, right).reshape(-1, 3)
-        length = 1.0
-        while length > 1e-3:
+        system = jacobian.T @ jacobian + prior
+        right = jacobian.T @ (weight * gap_of(q)) + prior @ force[nodes].ravel()
+        fall = -np.inf
+        while fall <= 0.0 and damping <= LAST_DAMPING:
             trial = force.copy()
-            trial[nodes] += length * step
+            trial[nodes] -= np.linalg.solve(system + damping * prior, right).reshape(-1, 3)
             try:
                 trial_q = equilibrium(trial, q)
-            except SimulationError:  # too far at once: a shorter step, and an error when none is short enough
-                trial_value = np.inf
+            except SimulationError:  # too far at once: damped more, the next trial is nearer
+                fall = -np.inf
             else:
-                trial_value = objective(trial_q, trial)
-            if trial_value < value:
-                break
-            length *= 0.5
-        else:
+                fall = value - objective(trial_q, trial)
+            damping *= 0.1 if fall > 0.0 else 10.0
+        if fall <= 0.0:
             break
-        fall = value - trial_value
-        q, force, value = trial_q, trial, trial_value
-        if fall < CONVERGED * value:
+        q, force, value = trial_q, trial, value - fall
+        if damping < 1.0 and fall < CONVERGED * value:
             break
     observed = sigma[seen].ravel() < 10.0 * np.median(sigma[seen])
     residual = float(np.sqrt((gap_of(q)[observed] ** 2).mean() * 3.0))

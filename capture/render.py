@@ -42,9 +42,7 @@ class Look:
 @njit(cache=True, nogil=True)
 def _texture(x, y, z):  # type: ignore[no-untyped-def]
     """A mottled skin, about -1 to 1, fixed to the body; x, y, z in mm."""
-    return 0.7 * np.sin(1.9 * x + 0.7 * y) * np.sin(1.3 * z - 1.1 * y) + 0.4 * np.sin(
-        5.3 * x - 4.1 * z + 3.1 * y
-    )
+    return 0.7 * np.sin(1.9 * x + 0.7 * y) * np.sin(1.3 * z - 1.1 * y) + 0.4 * np.sin(5.3 * x - 4.1 * z + 3.1 * y)
 
 
 @njit(cache=True, nogil=True)
@@ -111,9 +109,7 @@ class Painter:
     backdrop: Array
 
     @classmethod
-    def of(
-        cls, specimen: Specimen, camera: OrthographicCamera, look: Look, random: np.random.Generator
-    ) -> "Painter":
+    def of(cls, specimen: Specimen, camera: OrthographicCamera, look: Look, random: np.random.Generator) -> "Painter":
         """A painter with its own backdrop."""
         return cls(specimen, camera, look, _backdrop(specimen, camera, look, random))
 
@@ -185,9 +181,7 @@ def develop(picture: Array, look: Look, random: np.random.Generator) -> NDArray[
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
-def _backdrop(
-    specimen: Specimen, camera: OrthographicCamera, look: Look, random: np.random.Generator
-) -> Array:
+def _backdrop(specimen: Specimen, camera: OrthographicCamera, look: Look, random: np.random.Generator) -> Array:
     width, height = camera.image_size
     picture = np.full((height, width), 60.0)
     if look.background == "clutter":

@@ -83,9 +83,7 @@ def _read_c3d(path: Path, source: str) -> Recorded:
     try:
         file = ezc3d.c3d(str(path))
     except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(
-            f"expected a C3D file in {path}, which cannot be read: {error}; export again"
-        ) from None
+        raise InputError(f"expected a C3D file in {path}, which cannot be read: {error}; export again") from None
     group = file["parameters"]["POINT"]
     names = tuple(str(name) for name in group["LABELS"]["value"])
     unit = str(group["UNITS"]["value"][0]).strip() if group["UNITS"]["value"] else "mm"
@@ -105,9 +103,7 @@ def _read_npy(path: Path, fps: float, source: str) -> Recorded:
     try:
         content = np.load(path, allow_pickle=False)
     except (OSError, ValueError) as error:
-        raise InputError(
-            f"expected an array in {path}, which cannot be read: {error}; save it again"
-        ) from None
+        raise InputError(f"expected an array in {path}, which cannot be read: {error}; save it again") from None
     if content.ndim != 3 or content.shape[2] != 3 or len(content) < 3:
         raise InputError(
             f"{path}: expected an array (1 + frames, markers, 3) in mm with the rest pose in row 0, found "
@@ -115,9 +111,7 @@ def _read_npy(path: Path, fps: float, source: str) -> Recorded:
         )
     position = 1e-3 * content.astype(float)
     if np.nanmax(np.abs(position)) > LARGEST_PLAUSIBLE:
-        raise InputError(
-            f"{path}: expected mm, found values up to {np.nanmax(np.abs(content)):g}; save in mm"
-        )
+        raise InputError(f"{path}: expected mm, found values up to {np.nanmax(np.abs(content)):g}; save in mm")
     sigma = np.full_like(position[1:], ASSUMED_SIGMA)
     time = np.arange(len(position) - 1) / fps
     return Recorded(None, time, position[1:], sigma, position[0], False, source)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -12,7 +12,7 @@ from rafl.markers import Markers, embed, embedding_gap
 from rafl.material import Material
 from rafl.mesh import HexMesh
 from rafl.simulator import Simulator
-from tracking.layout import SPECIMEN_FORMAT, MarkerEntry, MarkerLayout
+from tracking.layout import SPECIMEN_FORMAT, MarkerLayout, MarkerList
 
 Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
 
@@ -39,7 +39,7 @@ class _Material(StrictModel):
 
 class _Clamp(StrictModel):
     face: Face
-    markers: list[MarkerEntry] = Field(default_factory=list)
+    markers: MarkerList = Field(default_factory=list)
 
 
 class _Load(StrictModel):
@@ -53,7 +53,7 @@ class _SpecimenFile(StrictModel):
     material: _Material
     clamp: _Clamp
     load: _Load = _Load(face="x-max")
-    markers: list[MarkerEntry] = Field(min_length=1)
+    markers: Annotated[MarkerList, Field(min_length=1)]
 
 
 @dataclass(frozen=True)

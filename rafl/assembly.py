@@ -11,10 +11,7 @@ def _project_symmetric(A):  # type: ignore[no-untyped-def]
     """Replace the negative eigenvalues of A (3, 3) by zero, in place; nothing to do when definite."""
     minor = A[0, 0] * A[1, 1] - A[0, 1] * A[0, 1]
     determinant = (
-        A[2, 2] * minor
-        - A[0, 0] * A[1, 2] * A[1, 2]
-        - A[1, 1] * A[0, 2] * A[0, 2]
-        + 2.0 * A[0, 1] * A[0, 2] * A[1, 2]
+        A[2, 2] * minor - A[0, 0] * A[1, 2] * A[1, 2] - A[1, 1] * A[0, 2] * A[0, 2] + 2.0 * A[0, 1] * A[0, 2] * A[1, 2]
     )
     if A[0, 0] > 0.0 and minor > 0.0 and determinant > 0.0:
         return
@@ -77,9 +74,7 @@ def element_terms(q, hexes, gradient, volume, mu, lam, project, tangent, energy,
                     )
                 for i in range(3):
                     f[n, i] += w * (
-                        U[i, 0] * first[0] * g[n, 0]
-                        + U[i, 1] * first[1] * g[n, 1]
-                        + U[i, 2] * first[2] * g[n, 2]
+                        U[i, 0] * first[0] * g[n, 0] + U[i, 1] * first[1] * g[n, 1] + U[i, 2] * first[2] * g[n, 2]
                     )
             if not tangent:
                 continue
@@ -112,9 +107,7 @@ def element_terms(q, hexes, gradient, volume, mu, lam, project, tangent, energy,
                             Uh[i, k] = U[i, 0] * h[0, k] + U[i, 1] * h[1, k] + U[i, 2] * h[2, k]
                     for i in range(3):
                         for k in range(3):
-                            K[3 * a + i, 3 * b + k] += (
-                                Uh[i, 0] * U[k, 0] + Uh[i, 1] * U[k, 1] + Uh[i, 2] * U[k, 2]
-                            )
+                            K[3 * a + i, 3 * b + k] += Uh[i, 0] * U[k, 0] + Uh[i, 1] * U[k, 1] + Uh[i, 2] * U[k, 2]
         energy[t, e] = total
 
 

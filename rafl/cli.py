@@ -12,11 +12,14 @@ from rich.table import Table
 from groundwork import InputError, command_line, progress, user_command, write_text
 from rafl.dataset import Dataset, read_dataset
 from rafl.evaluation import Comparison, compare, error_table, held_out_errors, split_table
-from rafl.fit import fit_residual_field
+from rafl.fit import fit_residual_field, training_recordings
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
 from rafl.simulator import SimulationError
 from rafl.sysid import identify_material
+
+# The network is small; the other core serves the element kernels.
+TORCH_THREADS = 1
 
 fit_app = command_line("Fit a model to recordings.")
 eval_app = command_line("Measure a fitted model.")
@@ -37,9 +40,7 @@ def _simulating(error: SimulationError) -> typer.Exit:
 @fit_app.command()
 @user_command
 def fit(
-    datasets: Annotated[
-        list[Path], typer.Argument(help="Dataset files (.h5) to train on.", metavar="DATASET...")
-    ],
+    datasets: Annotated[list[Path], typer.Argument(help="Dataset files (.h5) to train on.", metavar="DATASET...")],
     method: Annotated[Method, typer.Option(help="rafl: residual field; sysid: E and nu.")] = Method.rafl,
     out: Annotated[Path | None, typer.Option(help="Run folder [runs/<dataset>-<method>].")] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the recordings, at most.")] = 60,
@@ -54,13 +55,14 @@ def fit(
 
     Example: rafl-fit datasets/thick.h5 --out runs/thick
     """
-    torch.set_num_threads(2)
+    torch.set_num_threads(TORCH_THREADS)
     loaded = [read_dataset(path) for path in datasets]
     run = out or Path("runs") / f"{loaded[0].name}-{method.value}"
     settings = Settings(
         method.value, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
         weight_decay, patience, frames, seed,
     )  # fmt: skip
+    training_recordings(loaded)  # refused before anything is written
     _open_run(run, settings, resume)
     with progress() as bar:
         task = bar.add_task("epoch", total=epochs)
@@ -85,9 +87,7 @@ def _open_run(run: Path, settings: Settings, resume: bool) -> None:
     if resume:
         earlier = read_settings(run)
         if earlier != settings:
-            raise InputError(
-                f"expected the settings in {run}/config.yaml to resume, found others; use the same"
-            )
+            raise InputError(f"expected the settings in {run}/config.yaml to resume, found others; use the same")
         return
     if (run / "config.yaml").exists():
         raise InputError(f"{run} already holds a run; choose another --out, or go on with --resume")
@@ -106,15 +106,13 @@ def evaluate(
     paths: Annotated[
         list[Path], typer.Argument(help="Run folders and dataset files (.h5).", metavar="RUN... DATASET...")
     ],
-    out: Annotated[
-        Path | None, typer.Option(help="Folder for errors.csv and report.html [the first run].")
-    ] = None,
+    out: Annotated[Path | None, typer.Option(help="Folder for errors.csv and report.html [the first run].")] = None,
 ) -> None:
     """Compare original and fitted simulators with the recordings.
 
     Example: rafl-eval runs/thick datasets/thick.h5 datasets/thin.h5
     """
-    torch.set_num_threads(2)
+    torch.set_num_threads(TORCH_THREADS)
     runs = [path for path in paths if path.suffix != ".h5"]
     files = [path for path in paths if path.suffix == ".h5"]
     if not runs or not files:

@@ -121,9 +121,7 @@ def write_dataset(path: Path, dataset: Dataset) -> None:
 
 
 def _put(file: h5py.File, key: str, value: NDArray) -> None:
-    file.create_dataset(
-        key, data=value, fletcher32=value.size > 0, chunks=value.shape if value.size else None
-    )
+    file.create_dataset(key, data=value, fletcher32=value.size > 0, chunks=value.shape if value.size else None)
 
 
 def read_dataset(path: Path) -> Dataset:
@@ -140,8 +138,7 @@ def read_dataset(path: Path) -> Dataset:
     except (OSError, KeyError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
-            f"expected a dataset written by rafl-capture in {path}, which cannot be read: {reason}; "
-            "build it again"
+            f"expected a dataset written by rafl-capture in {path}, which cannot be read: {reason}; build it again"
         ) from None
     if not dataset.trajectories:
         raise InputError(f"expected at least one trajectory in {path}, found none; run rafl-capture again")

@@ -122,6 +122,5 @@ def held_out_errors(comparisons: list[Comparison]) -> dict[str, float]:
     if not chosen:
         return {}
     return {
-        method: float(np.concatenate([item.errors[method] for item in chosen]).mean())
-        for method in chosen[0].errors
+        method: float(np.concatenate([item.errors[method] for item in chosen]).mean()) for method in chosen[0].errors
     }

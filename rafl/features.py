@@ -99,9 +99,7 @@ def features(q: Tensor, v: Tensor, points: GaussPoints, gravity: Tensor) -> tupl
     R, stretch = _PolarStretch.apply(F)
     local = R.mT @ F  # right stretch tensor S; L co-rotated is R^T rate F^-1 R = R^T rate S^-1
     a, b, c = local.unbind(-1)
-    cofactor = torch.stack(
-        [torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-2
-    )
+    cofactor = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-2)
     determinant = (a * cofactor[:, 0]).sum(-1, keepdim=True)
     L = R.mT @ rate @ (cofactor / determinant[..., None])
     D = 0.5 * (L + L.mT)

@@ -26,9 +26,7 @@ from rafl.run import (
 )
 from rafl.simulator import SimulationError
 
-GRADIENT_LIMIT = (
-    10.0  # Adam's step does not depend on the size; a diverging rollout's must not enter its memory
-)
+GRADIENT_LIMIT = 10.0  # Adam's step does not depend on the size; a diverging rollout's must not enter its memory
 
 Report = Callable[[dict[str, float]], None]
 
@@ -100,9 +98,7 @@ def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, r
     field = ResidualField()
     field.scale_to([_sample_features(recordings) for recordings in train])
     model = FittedModel("rafl", field=field)
-    optimiser = torch.optim.Adam(
-        field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-    )
+    optimiser = torch.optim.Adam(field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
         optimiser, settings.epochs, eta_min=0.02 * settings.learning_rate
     )

@@ -36,9 +36,7 @@ class Markers:
         corners = q[..., torch.from_numpy(self.quad), :]  # (..., M, 4, 3)
         along, across = torch.from_numpy(self._tangent_weights)
         point = (corners * torch.from_numpy(self.weights)[:, :, None]).sum(-2)
-        normal = torch.linalg.cross(
-            (corners * along[:, :, None]).sum(-2), (corners * across[:, :, None]).sum(-2)
-        )
+        normal = torch.linalg.cross((corners * along[:, :, None]).sum(-2), (corners * across[:, :, None]).sum(-2))
         normal = normal / torch.linalg.norm(normal, dim=-1, keepdim=True)
         return point + torch.from_numpy(self.normal_offset)[:, None] * normal
 

@@ -53,9 +53,7 @@ class HexMesh:
         axes = [np.linspace(0.0, s, n + 1) for s, n in zip(np.asarray(size), (nx, ny, nz), strict=True)]
         vertices = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         i, j, k = (a.ravel() for a in np.meshgrid(*map(np.arange, (nx, ny, nz)), indexing="ij"))
-        corners = [
-            ((i + int(di)) * (ny + 1) + j + int(dj)) * (nz + 1) + k + int(dk) for di, dj, dk in CORNERS
-        ]
+        corners = [((i + int(di)) * (ny + 1) + j + int(dj)) * (nz + 1) + k + int(dk) for di, dj, dk in CORNERS]
         return cls(vertices, np.stack(corners, axis=1).astype(np.int64))
 
     @cached_property

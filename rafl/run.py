@@ -104,9 +104,7 @@ def load_tensors(path: Path, what: str) -> dict:
         content = torch.load(path, weights_only=True)
     except Exception as error:  # torch raises many kinds here; all mean the same to the user
         reason = str(error).splitlines()[0]
-        raise InputError(
-            f"expected {what} in {path}, which cannot be read: {reason:.120}; fit again"
-        ) from None
+        raise InputError(f"expected {what} in {path}, which cannot be read: {reason:.120}; fit again") from None
     if not isinstance(content, dict) or "method" not in content:
         raise InputError(f"expected {what} in {path}, found something else; fit again")
     check_format(str(content.get("format", "")), FORMAT, path)

@@ -96,9 +96,7 @@ class Simulator:
         order = np.argsort(self.unknown)[(self.unknown < 0).sum() :]
         return (3 * order[:, None] + np.arange(3)).ravel()
 
-    def _terms(
-        self, q: Array, mu: Array, lam: Array, *, project: bool, tangent: bool
-    ) -> tuple[Array, Array, Array]:
+    def _terms(self, q: Array, mu: Array, lam: Array, *, project: bool, tangent: bool) -> tuple[Array, Array, Array]:
         """Energy (B), nodal gradient (B, N, 3) and cell stiffnesses (B, E, 24, 24) of positions q."""
         batch, cells = len(q), len(self.mesh.hexes)
         energy = np.empty((batch, cells))
@@ -205,9 +203,7 @@ class Simulator:
                 # Close to the minimum energies differ by rounding only: the residual decides there.
                 slack = 1e-13 * (np.abs(energy[rows]) + 1e-9)
                 lower = e <= energy[rows] + 1e-4 * length[rows] * slope[rows]
-                close = (e <= energy[rows] + slack) & (
-                    np.abs(r).max(axis=1) < np.abs(residual[rows]).max(axis=1)
-                )
+                close = (e <= energy[rows] + slack) & (np.abs(r).max(axis=1) < np.abs(residual[rows]).max(axis=1))
                 for i in np.flatnonzero(lower | close):
                     row = rows[i]
                     q[active[row]] = trial[i]
@@ -225,9 +221,7 @@ class Simulator:
             "try a smaller time step or load"
         )
 
-    def step(
-        self, q: Array, v: Array, force: Array, mu: Array, lam: Array, mass: Array, what: str = "step"
-    ) -> Array:
+    def step(self, q: Array, v: Array, force: Array, mu: Array, lam: Array, mass: Array, what: str = "step") -> Array:
         """One implicit Euler step (paper, eq. 1) of a batch; returns the new positions (B, N, 3).
 
         Args:

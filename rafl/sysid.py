@@ -67,7 +67,7 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
 
     def scaled(y: np.ndarray) -> tuple[float, np.ndarray]:
         value, slope = objective(y * scale)
-        return value, slope * scale
+        return value / history[0]["loss"], slope * scale / history[0]["loss"]
 
     result = minimize(
         scaled,
@@ -76,7 +76,7 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         method="L-BFGS-B",
         bounds=[LOG_MODULUS, (POISSON[0] / scale[1], POISSON[1] / scale[1])],
         callback=lambda y: record(y * scale),
-        options={"maxiter": settings.epochs, "ftol": 1e-7},
+        options={"maxiter": settings.epochs, "ftol": 1e-8, "gtol": 1e-8},
     )
     best = result.x * scale
     model = FittedModel("sysid", material=(float(np.exp(best[0])), float(best[1])))

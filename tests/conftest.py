@@ -1,18 +1,14 @@
 """Specimens, datasets and recordings that several tests start from."""
 
-import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from support import Run
 
 from capture.specimen import Specimen, read_specimen
-
-ROOT = Path(__file__).parent.parent
-SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared"))
 
 SMALL = """format: rafl-specimen/1
 name: small
@@ -47,9 +43,6 @@ def small_specimen(tmp_path_factory: pytest.TempPathFactory) -> Specimen:
     return read_specimen(path)
 
 
-Run = Callable[..., subprocess.CompletedProcess[str]]
-
-
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     """Run a console script in a temporary folder, as a stranger would."""
@@ -60,16 +53,6 @@ def run(tmp_path: Path) -> Run:
         return subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600)
 
     return command
-
-
-def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> None:
-    """One line on standard error that names all parts, exit code 2, no traceback."""
-    assert result.returncode == 2, result.stdout + result.stderr
-    lines = [line for line in result.stderr.splitlines() if line.strip()]
-    assert len(lines) == 1, result.stderr
-    assert lines[0].startswith("error: ")
-    for part in parts:
-        assert part in lines[0], (part, lines[0])
 
 
 @pytest.fixture

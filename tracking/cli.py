@@ -31,9 +31,7 @@ def track(
     out: Annotated[Path, typer.Option(help="Folder for the tracks.")] = Path("tracks"),
     fps: Annotated[float | None, typer.Option(min=0.1, help="True frames per second.")] = None,
     fill: Annotated[int, typer.Option(min=0, help="Longest gap bridged [frames].")] = 5,
-    overlay: Annotated[
-        bool, typer.Option("--overlay", help="Also write videos with names drawn in.")
-    ] = False,
+    overlay: Annotated[bool, typer.Option("--overlay", help="Also write videos with names drawn in.")] = False,
     jobs: Annotated[int, typer.Option(min=1, help="Recordings side by side.")] = 2,
 ) -> None:
     """Find the dots in every recording, follow and name them, and place them in 3-D.
@@ -46,9 +44,7 @@ def track(
     done: dict[str, Tracks] = {}
     failed: dict[str, str] = {}
     with progress() as bar, ThreadPoolExecutor(jobs) as pool:
-        waiting = {
-            name: pool.submit(_one, name, sources, rig, settings, bar) for name, sources in recordings.items()
-        }
+        waiting = {name: pool.submit(_one, name, sources, rig, settings, bar) for name, sources in recordings.items()}
         for name, future in waiting.items():
             try:
                 done[name] = future.result()
@@ -81,9 +77,7 @@ def _one(name: str, sources: dict[str, Video], rig: Rig, settings: TrackingSetti
 
 
 def _summary(done: dict[str, Tracks]) -> Table:
-    table = Table(
-        "recording", "frames", "markers", "measured", "filled", "gaps", "sigma [px]", "residual [px]"
-    )
+    table = Table("recording", "frames", "markers", "measured", "filled", "gaps", "sigma [px]", "residual [px]")
     for name, tracks in done.items():
         state = tracks.state
         gone = state != MEASURED

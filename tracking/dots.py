@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-RADII = (3.0, 20.0)  # of the dots looked for [px]
+RADII = (3.0, 32.0)  # of the dots looked for [px]
 FLATTEST = 0.4  # least ratio of the axes
 ROUNDEST = 0.75  # least share of the outline's ellipse that is filled
 LEAST_CONTRAST = 12.0  # grey levels
@@ -199,7 +199,7 @@ def candidates(image: NDArray[np.uint8], dark: bool) -> Array:
     """
     found: list[Array] = []
     signed = 255 - image if dark else image
-    for radius in (4.0, 8.0, 16.0):
+    for radius in (4.0, 8.0, 16.0, 27.0):
         side = int(6 * radius) | 1
         mean = cv2.boxFilter(signed, -1, (side, side), borderType=cv2.BORDER_REFLECT)
         mask = (signed > cv2.add(mean, LEAST_CONTRAST)).astype(np.uint8)
@@ -241,9 +241,7 @@ def _blobs(image: NDArray[np.uint8], mask: NDArray[np.uint8], scale: float) -> l
         edge = np.concatenate([around[0], around[-1], around[:, 0], around[:, -1]])
         level = float(np.median(edge))
         starts.append(
-            np.array(
-                [cx, cy, outline[0, 0], outline[0, 1], outline[1, 1], 0.7, inside - level, level, 0.0, 0.0]
-            )
+            np.array([cx, cy, outline[0, 0], outline[0, 1], outline[1, 1], 0.7, inside - level, level, 0.0, 0.0])
         )
     return starts
 

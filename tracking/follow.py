@@ -77,9 +77,7 @@ def find_family(image: NDArray[np.uint8]) -> tuple[Family, Dots] | None:
     for dark in (True, False):
         dots = find_dots(image, dark)
         dots = dots[(dots.residual < 0.15) & (dots.flattening > 0.6)]
-        quality = np.clip(1.0 - dots.residual / 0.15, 0.0, 1.0) * np.minimum(
-            np.abs(dots.contrast) / 60.0, 1.0
-        )
+        quality = np.clip(1.0 - dots.residual / 0.15, 0.0, 1.0) * np.minimum(np.abs(dots.contrast) / 60.0, 1.0)
         for seed in range(len(dots)):
             alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2)
             alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)
@@ -88,9 +86,7 @@ def find_family(image: NDArray[np.uint8]) -> tuple[Family, Dots] | None:
                 members = dots[alike]
                 sigma = float(np.median(members.sigma))
                 members = members[members.sigma < max(5.0 * sigma, 0.05)]
-                family = Family(
-                    dark, float(np.median(members.radius)), float(np.median(members.contrast)), sigma
-                )
+                family = Family(dark, float(np.median(members.radius)), float(np.median(members.contrast)), sigma)
                 best = (score, family, members)
     return None if best is None else (best[1], best[2])
 
@@ -116,7 +112,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
             if found is None or count < FEWEST_MARKERS:
                 raise InputError(
                     f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in the first frame, "
-                    f"found {count}; check that dots of 3 to 20 px radius contrast with the skin"
+                    f"found {count}; check that dots of 3 to 32 px radius contrast with the skin"
                 )
             tracker = Tracker(*found)
             pixel, sigma = found[1].centre, found[1].sigma
@@ -216,9 +212,7 @@ class Tracker:
 
     def _two_in_one_place(self, pixel: Array) -> bool:
         seen = pixel[np.isfinite(pixel[:, 0])]
-        return len(seen) > 1 and bool(
-            (cKDTree(seen).query(seen, 2)[0][:, 1] < 0.5 * self.family.radius).any()
-        )
+        return len(seen) > 1 and bool((cKDTree(seen).query(seen, 2)[0][:, 1] < 0.5 * self.family.radius).any())
 
     def _assign(self, dots: Dots) -> tuple[Array, Array]:
         """All markers to dots at once.

@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 from groundwork import StrictModel, check_format, read_yaml
 
@@ -19,22 +20,24 @@ class MarkerEntry(StrictModel):
     at_mm: tuple[float, float, float]
 
 
+def _different_names(markers: list[MarkerEntry]) -> list[MarkerEntry]:
+    names = [marker.name for marker in markers]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(f"expected different names, {sorted(twice)[0]} occurs twice")
+    return markers
+
+
+MarkerList = Annotated[list[MarkerEntry], AfterValidator(_different_names)]
+
+
 class MarkerEntries(BaseModel):
     """The part of a specimen file that tracking reads; the rest is for others."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     format: str
-    markers: list[MarkerEntry] = Field(min_length=1)
-
-    @field_validator("markers")
-    @classmethod
-    def _different_names(cls, markers: list[MarkerEntry]) -> list[MarkerEntry]:
-        names = [marker.name for marker in markers]
-        twice = {name for name in names if names.count(name) > 1}
-        if twice:
-            raise ValueError(f"expected different names, {sorted(twice)[0]} occurs twice")
-        return markers
+    markers: Annotated[MarkerList, Field(min_length=1)]
 
 
 @dataclass(frozen=True)

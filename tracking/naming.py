@@ -121,11 +121,9 @@ def _carried(
     source_mean, target_mean = weight @ source, weight @ target
     source, target = source - source_mean, target - target_mean
     size = (weight[:, None] * source**2).sum()
-    ridge = 0.3 * size + 1e-9
+    ridge = 0.03 * size + 1e-9
     moment = (weight[:, None] * source).T @ source
-    affine = ((weight[:, None] * target).T @ source + ridge * rotation) @ np.linalg.inv(
-        moment + ridge * np.eye(2)
-    )
+    affine = ((weight[:, None] * target).T @ source + ridge * rotation) @ np.linalg.inv(moment + ridge * np.eye(2))
     return target_mean + affine @ (expected[marker] - source_mean)
 
 

@@ -34,9 +34,7 @@ class TrackingSettings:
     fill: int
 
 
-def track_recording(
-    videos: dict[str, Video], rig: Rig, settings: TrackingSettings, tick: Callable[[], None]
-) -> Tracks:
+def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettings, tick: Callable[[], None]) -> Tracks:
     """Find, follow, name and reconstruct the markers of one recording.
 
     Args:
@@ -51,10 +49,7 @@ def track_recording(
     followed = {camera: follow(video, tick) for camera, video in videos.items()}
     frames = min(len(item.time) for item in followed.values())
     time = _time(followed, videos, settings.fps, frames)
-    names = {
-        camera: _names(item, videos[camera], rig, camera, settings.layout)
-        for camera, item in followed.items()
-    }
+    names = {camera: _names(item, videos[camera], rig, camera, settings.layout) for camera, item in followed.items()}
     order = _all_names(names, settings.layout)
     pixels = {}
     for camera, item in followed.items():
@@ -69,9 +64,7 @@ def track_recording(
     position, sigma, state = fill_gaps(position, sigma, time, settings.fill)
     measured = int((state == MEASURED).any(axis=0).sum())
     if measured < FEWEST_MARKERS:
-        raise InputError(
-            f"expected at least {FEWEST_MARKERS} markers, tracked {measured}; check the lighting"
-        )
+        raise InputError(f"expected at least {FEWEST_MARKERS} markers, tracked {measured}; check the lighting")
     return Tracks(
         tuple(order),
         time,
@@ -89,9 +82,7 @@ def track_recording(
     )
 
 
-def _time(
-    followed: dict[str, PixelTracks], videos: dict[str, Video], fps: float | None, frames: int
-) -> Array:
+def _time(followed: dict[str, PixelTracks], videos: dict[str, Video], fps: float | None, frames: int) -> Array:
     """The recording's clock [s], (T): `fps` where given, else the videos' own timestamps."""
     if frames < 2:
         raise InputError("expected at least two frames; is the video complete?")
@@ -119,9 +110,7 @@ def _time(
     return first
 
 
-def _names(
-    item: PixelTracks, video: Video, rig: Rig, camera: str, layout: MarkerLayout | None
-) -> list[str | None]:
+def _names(item: PixelTracks, video: Video, rig: Rig, camera: str, layout: MarkerLayout | None) -> list[str | None]:
     if layout is not None:
         chosen = name_by_layout(item.start, layout, rig.cameras[camera], str(video.path))
         return [layout.names[index] if index >= 0 else None for index in chosen]

@@ -94,15 +94,12 @@ def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array
     variance = np.diagonal(covariance, axis1=-2, axis2=-1)
     sigma = np.where(known[..., None], np.sqrt(variance), np.nan)
     residual = {
-        name: np.linalg.norm(rig.cameras[name].project(position) - item.pixel, axis=-1)
-        for name, item in pixels.items()
+        name: np.linalg.norm(rig.cameras[name].project(position) - item.pixel, axis=-1) for name, item in pixels.items()
     }
     return position, sigma, residual
 
 
-def fill_gaps(
-    position: Array, sigma: Array, time: Array, longest: int
-) -> tuple[Array, Array, NDArray[np.uint8]]:
+def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple[Array, Array, NDArray[np.uint8]]:
     """Bridge gaps of up to `longest` frames by a cubic through what was measured.
 
     Sigma grows by half the curve's bend across the gap. Longer gaps stay NaN.

@@ -48,9 +48,7 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
 
 
 def _pictures_in(folder: Path) -> list[Path]:
-    return sorted(
-        (path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES), key=natural_key
-    )
+    return sorted((path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES), key=natural_key)
 
 
 def is_video(path: Path) -> bool:
@@ -95,9 +93,7 @@ def _folder_pictures(folder: Path) -> Iterator[tuple[None, NDArray[np.uint8]]]:
     for path in _pictures_in(folder):
         picture = _read_picture(path)
         if size is not None and picture.shape != size:
-            raise InputError(
-                f"expected pictures of one size in {folder}, found another in {path.name}; remove it"
-            )
+            raise InputError(f"expected pictures of one size in {folder}, found another in {path.name}; remove it")
         size = picture.shape
         yield None, picture
 
@@ -111,9 +107,7 @@ def _file_pictures(path: Path) -> Iterator[tuple[float | None, NDArray[np.uint8]
             stream.thread_type = "AUTO"
             for frame in container.decode(stream):
                 if frame.is_corrupt:
-                    raise InputError(
-                        f"{path}: frame {number} is damaged; copy the video again from the camera"
-                    )
+                    raise InputError(f"{path}: frame {number} is damaged; copy the video again from the camera")
                 time = None
                 if frame.pts is not None and frame.time_base is not None:
                     moment = float(frame.pts * frame.time_base)
@@ -131,10 +125,7 @@ def _file_pictures(path: Path) -> Iterator[tuple[float | None, NDArray[np.uint8]
 
 def _luma(frame: av.VideoFrame) -> NDArray[np.uint8]:
     """The luma plane as it is stored, or the grey of a format without one."""
-    if (
-        frame.format.name.startswith(("yuv4", "yuvj4", "gray8", "nv12"))
-        and frame.format.components[0].bits == 8
-    ):
+    if frame.format.name.startswith(("yuv4", "yuvj4", "gray8", "nv12")) and frame.format.components[0].bits == 8:
         plane = frame.planes[0]
         rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
         return rows[:, : plane.width].copy()

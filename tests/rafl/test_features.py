@@ -57,9 +57,7 @@ def test_features_of_a_known_motion(mesh: HexMesh) -> None:
     A = R @ np.diag([1.1, 0.9, 1.0])
     B = np.array([[0.1, 0.4, 0.0], [-0.2, 0.3, 0.5], [0.1, 0.0, -0.6]])
     q = mesh.vertices @ A.T
-    values, rotation = features(
-        torch.tensor(q[None]), torch.tensor((q @ B.T)[None]), GaussPoints.of(mesh, 1070.0), G
-    )
+    values, rotation = features(torch.tensor(q[None]), torch.tensor((q @ B.T)[None]), GaussPoints.of(mesh, 1070.0), G)
     np.testing.assert_allclose(rotation[0, 0, 0].numpy(), R, atol=1e-13)
     one = values[0, 1, 5].numpy()
     local = R.T @ B @ R
@@ -81,9 +79,8 @@ def test_force_turns_with_the_body(field: tuple[ResidualField, Simulator], rando
     turn = torch.tensor(Rotation.from_rotvec([0.2, 1.0, -0.4]).as_matrix())
     q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
     v = torch.tensor(random.normal(0, 0.2, q.shape))
-    turned = Simulator(
-        simulator.mesh, simulator.material, simulator.fixed, gravity=tuple((turn @ torch.tensor(simulator.gravity, dtype=torch.float64)).tolist())
-    )  # fmt: skip
+    gx, gy, gz = (turn @ torch.tensor(simulator.gravity, dtype=torch.float64)).tolist()
+    turned = Simulator(simulator.mesh, simulator.material, simulator.fixed, gravity=(gx, gy, gz))
     force = model.on(simulator)(q, v)
     torch.testing.assert_close(model.on(turned)(q @ turn.T, v @ turn.T), force @ turn.T, atol=1e-12, rtol=1e-9)
 

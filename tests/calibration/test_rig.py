@@ -1,0 +1,45 @@
+from pathlib import Path
+
+import pytest
+
+from calibration.camera import OrthographicCamera, Plane
+from calibration.rig import Rig, read_rig, write_rig
+from groundwork import InputError
+
+CAMERA = OrthographicCamera(
+    (640, 480), (9000.0, 9010.0), 3.0, (0.1, 1.5, -0.2), (12.0, 34.0), (1e-3, 0.0),
+    Plane((0.0, -1.0, 0.0), 0.03, 4e-4), 0.002, 0.05, tuple(tuple(float(i * j) for j in range(10)) for i in range(10)),
+)  # fmt: skip
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    write_rig(tmp_path / "calib.yaml", Rig({"left": CAMERA}))
+    back = read_rig(tmp_path / "calib.yaml").cameras["left"]
+    for key in ("scale", "rotation_vector", "offset", "distortion"):
+        assert getattr(back, key) == pytest.approx(getattr(CAMERA, key))
+    assert back.plane is not None
+    assert back.plane.normal == (0.0, -1.0, 0.0)
+    assert back.plane.offset == pytest.approx(0.03)
+    assert back.plane.sigma == pytest.approx(4e-4)
+    assert (back.skew, back.time_offset, back.residual) == pytest.approx((3.0, 0.002, 0.05))
+    assert back.covariance == CAMERA.covariance
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "part"),
+    [
+        ("rafl-calibration/1", "rafl-calibration/2", "newer"),
+        ("orthographic", "pinhole", "left.model"),
+        ("skew", "skewed", "skewed"),
+        ("[640, 480]", "[640, 0]", "positive"),
+        ("[0.0, -1.0, 0.0]", "[0.0, -2.0, 0.0]", "length 1"),
+    ],
+)
+def test_bad_files_name_the_key(tmp_path: Path, old: str, new: str, part: str) -> None:
+    path = tmp_path / "calib.yaml"
+    write_rig(path, Rig({"left": CAMERA}))
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    with pytest.raises(InputError, match=part):
+        read_rig(path)

@@ -1,0 +1,165 @@
+from dataclasses import replace
+from pathlib import Path
+
+import ezc3d
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from capture.build import CaptureSettings, RecordingRow, build_dataset, read_recording_rows
+from capture.motion import tip_force, tip_load_release
+from capture.specimen import Specimen
+from groundwork import InputError
+from rafl.dataset import Dataset
+from tracking.layout import MarkerLayout
+
+SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0, None, True)
+FRAMES = 8
+LAB = (Rotation.from_rotvec([0.3, -0.8, 1.2]).as_matrix(), np.array([0.4, -0.1, 1.5]))
+
+
+@pytest.fixture(scope="module")
+def truth(small_specimen: Specimen) -> np.ndarray:
+    """Markers of a release under 60 g, (T, M, 3), and the undeformed ones before them in row 0."""
+    motion = tip_load_release(small_specimen, small_specimen.material, 0.06, FRAMES, 100.0)
+    markers = small_specimen.markers(1e-6)
+    moving = markers.positions(torch.from_numpy(motion.q)).numpy()
+    return np.concatenate([small_specimen.layout.positions[None], moving])
+
+
+def build(specimen: Specimen, folder: Path, settings: CaptureSettings = SETTINGS, **row: object) -> Dataset:
+    rows = [RecordingRow(recording="q0", load_g=60, split="train", **row)]  # type: ignore[arg-type]
+    return build_dataset(specimen, folder, rows, settings, "", lambda: None)
+
+
+def in_the_lab(points: np.ndarray) -> np.ndarray:
+    return points @ LAB[0].T + LAB[1]
+
+
+def write_c3d(path: Path, names: list[str], points: np.ndarray) -> None:
+    file = ezc3d.c3d()
+    file["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    file["parameters"]["POINT"]["LABELS"]["value"] = names
+    file["parameters"]["POINT"]["UNITS"]["value"] = ["mm"]
+    data = np.ones((4, points.shape[1], len(points)))
+    data[:3] = 1e3 * points.transpose(2, 1, 0)
+    file["data"]["points"] = data
+    file.write(str(path))
+
+
+def test_the_authors_arrays_are_registered_by_their_rest_row(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    np.save(tmp_path / "q0.npy", 1e3 * in_the_lab(truth))
+    item = build(small_specimen, tmp_path).trajectories["q0"]
+    np.testing.assert_allclose(item.markers, truth[1:], atol=1e-9)
+    np.testing.assert_allclose(item.time, 0.01 * np.arange(FRAMES))
+    assert item.attributes["registration_residual_mm"] < 1e-6
+    assert item.attributes["fit_residual_mm"] < 0.1
+    # The virtual force is the load: 60 g.
+    np.testing.assert_allclose(
+        item.virtual_force.sum(0), tip_force(small_specimen, 0.06).sum(0), atol=0.03
+    )  # fmt: skip
+
+
+def with_clamp(specimen: Specimen) -> Specimen:
+    places = np.array([[-0.01, -0.02, 0.0], [-0.01, 0.04, 0.0], [-0.01, 0.01, 0.05]])
+    return replace(specimen, clamp_layout=MarkerLayout(("C1", "C2", "C3"), places))
+
+
+def test_motion_capture_in_the_frame_of_a_moving_clamp(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    """The clamp shakes by a millimetre and a degree; in its frame the markers move as if it did not."""
+    specimen = with_clamp(small_specimen)
+    random = np.random.default_rng(5)
+    points = np.concatenate([truth[1:], np.broadcast_to(specimen.clamp_layout.positions, (FRAMES, 3, 3))], axis=1)
+    turns = Rotation.from_rotvec(random.normal(0, np.radians(1), (FRAMES, 3))).as_matrix()
+    shaken = np.einsum("tij,tmj->tmi", turns, points) + random.normal(0, 1e-3, (FRAMES, 1, 3))
+    write_c3d(tmp_path / "q0.c3d", [*specimen.layout.names, *specimen.clamp_layout.names], in_the_lab(shaken))
+    item = build(specimen, tmp_path).trajectories["q0"]
+    np.testing.assert_allclose(item.markers, truth[1:], atol=1e-6)  # C3D holds single precision
+    still = build(specimen, tmp_path, replace(SETTINGS, moving_clamp=False)).trajectories["q0"]
+    assert np.abs(still.markers - truth[1:]).max() > 5e-4
+
+
+def test_a_rest_frame_registers_files_without_a_clamp(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    write_c3d(tmp_path / "q0.c3d", list(small_specimen.layout.names), in_the_lab(truth))
+    with pytest.raises(InputError, match="way to the specimen frame"):
+        build(small_specimen, tmp_path)
+    settings = replace(SETTINGS, rest=("q0", 0))
+    item = build(small_specimen, tmp_path, settings, first_frame=1).trajectories["q0"]
+    np.testing.assert_allclose(item.markers, truth[1:], atol=1e-6)
+
+
+def test_gaps_and_chosen_frames(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    lost = in_the_lab(truth)
+    lost[4, 2:5] = np.nan
+    np.save(tmp_path / "q0.npy", 1e3 * lost)
+    item = build(small_specimen, tmp_path, first_frame=1, last_frame=6).trajectories["q0"]
+    assert len(item.time) == 6
+    assert item.time[0] == 0.0
+    assert not item.valid[2, 2:5].any()
+    assert item.valid.sum() == 6 * 20 - 3
+
+
+def test_a_hanging_load_stays_as_force_and_mass(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    np.save(tmp_path / "q0.npy", 1e3 * truth)
+    item = build(small_specimen, tmp_path, load="hanging").trajectories["q0"]
+    assert item.added_mass.sum() == pytest.approx(0.06)
+    np.testing.assert_allclose(item.load.sum(0), [0, 0, -0.06 * 9.80709])
+    released = build(small_specimen, tmp_path).trajectories["q0"]
+    assert released.added_mass.sum() == 0.0
+    assert np.abs(released.load).sum() == 0.0
+
+
+def test_what_does_not_fit_is_refused(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    path = tmp_path / "q0.npy"
+    for content, message in (
+        (1e3 * truth[:, :-1], "expected 20 markers .* found 19"),
+        (1e3 * truth[:, ::-1], "mm off"),
+        (1e3 * truth[:, :, :2], "found shape"),
+        (1e6 * truth, "expected mm"),
+    ):
+        np.save(path, content)
+        with pytest.raises(InputError, match=message):
+            build(small_specimen, tmp_path)
+    np.save(path, 1e3 * truth)
+    with pytest.raises(InputError, match="frames within 0 to 7"):
+        build(small_specimen, tmp_path, last_frame=8)
+    np.save(path, np.array([{}]), allow_pickle=True)
+    with pytest.raises(InputError, match="cannot be read"):
+        build(small_specimen, tmp_path)
+    path.unlink()
+    with pytest.raises(InputError, match=r"q0\.h5, \.c3d or \.npy"):
+        build(small_specimen, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("recording,load_g,split\na,50,training\n", "line 2, column split"),
+        ("recording,load_g,split\na,50,train\nb,heavy,test\n", "line 3, column load_g"),
+        ("recording,load,split\na,50,train\n", "line 2"),
+        ("recording,load_g,split\n", "at least one recording"),
+        ("recording,load_g,split\na,50,test\n", "split `train`"),
+        ("recording,load_g,split\na,50,train\na,60,test\n", "a stands there twice"),
+        ("", "save it as CSV"),
+    ],
+)
+def test_bad_tables_name_line_and_column(tmp_path: Path, text: str, message: str) -> None:
+    path = tmp_path / "recordings.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message):
+        read_recording_rows(path)
+
+
+def test_spreadsheet_habits_are_read(tmp_path: Path) -> None:
+    """A byte-order mark, spaces after commas and empty optional cells."""
+    path = tmp_path / "recordings.csv"
+    path.write_bytes(b"\xef\xbb\xbfrecording, load_g, split, first_frame\r\na, 50, train,\r\nb, 60, test, 3\r\n")
+    rows = read_recording_rows(path)
+    assert [(row.recording, row.load_g, row.first_frame) for row in rows] == [("a", 50, 0), ("b", 60, 3)]

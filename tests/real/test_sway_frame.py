@@ -1,0 +1,46 @@
+"""A model frame swayed by hand: 28 dots, 160 pictures, one camera."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from support import SHARED, Run
+
+FOLDER = SHARED / "real" / "sway_frame"
+pytestmark = [
+    pytest.mark.real,
+    pytest.mark.skipif(not FOLDER.is_dir(), reason=f"real recordings absent at {FOLDER}"),
+]
+
+CALIB = """format: rafl-calibration/1
+cameras:
+  front:
+    model: orthographic
+    image_size: [1300, 2046]
+    pixels_per_mm: [1.6, 1.6]
+    offset_px: [0, 0]
+    plane: {normal: [0, 0, 1], offset_mm: 0}
+"""
+
+
+def test_every_dot_is_followed(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "calib.yaml").write_text(CALIB)
+    result = run("rafl-track", FOLDER, "--calib", "calib.yaml", "--fps", "22.7", "--jobs", "1")
+    assert result.returncode == 0, result.stderr
+    with h5py.File(tmp_path / "tracks" / "sway_frame.h5") as file:
+        names = list(file.attrs["marker_names"])
+        pixel = file["cameras/front/pixel"][()]
+        measured = (file["state"][()] == 1).mean()
+        assert float(file.attrs["fps"]) == pytest.approx(22.7)
+    assert names == [f"r{row}c{column}" for row in (1, 2, 3, 4) for column in range(1, 8)]
+    assert measured > 0.995
+    # Where the dots stood in the first frame, by eye.
+    rows, columns = (471, 931, 1420, 1904), (148, 310, 466, 625, 778, 940, 1111)
+    by_eye = np.array([(x, y) for y in rows for x in columns])
+    assert np.abs(pixel[0] - by_eye).max() < 30
+    # Each row is a stiff bar: no dot takes another's place while the spacings hold.
+    spacing = np.diff(pixel.reshape(160, 4, 7, 2)[..., 0], axis=2)
+    assert np.nanmax(np.abs(spacing / np.nanmedian(spacing, axis=0) - 1.0)) < 0.05
+    still = np.nanstd(np.diff(pixel[:40], axis=0), axis=0) / np.sqrt(2)
+    assert np.median(still) < 0.03

@@ -1,0 +1,46 @@
+"""What tests share besides fixtures."""
+
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+ROOT = Path(__file__).parent.parent
+SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared"))
+
+Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> None:
+    """One line on standard error that names all parts, exit code 2, no traceback."""
+    assert result.returncode == 2, result.stdout + result.stderr
+    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("error: ")
+    for part in parts:
+        assert part in lines[0], (part, lines[0])
+
+
+def picture(
+    dots: list[tuple[float, float, float, float, float]], size: tuple[int, int] = (200, 160), dark: bool = True,
+    blur: float = 1.0, noise: float = 0.0, seed: int = 0,
+) -> np.ndarray:  # fmt: skip
+    """Ellipses (x, y, long and short semi-axis, angle) drawn much finer and averaged down."""
+    n = 8
+    cover = np.zeros(size[::-1])
+    for x, y, a, b, angle in dots:
+        left, top = max(int(x - a) - 2, 0), max(int(y - a) - 2, 0)
+        right, bottom = min(int(x + a) + 3, size[0]), min(int(y + a) + 3, size[1])
+        fine = [(np.arange(k * n) + 0.5) / n - 0.5 for k in (right - left, bottom - top)]
+        u, v = np.meshgrid(fine[0] + left - x, fine[1] + top - y)
+        along, across = np.cos(angle) * u + np.sin(angle) * v, -np.sin(angle) * u + np.cos(angle) * v
+        inside = ((along / a) ** 2 + (across / b) ** 2 < 1).astype(float)
+        part = cv2.resize(inside, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
+        cover[top:bottom, left:right] = np.maximum(cover[top:bottom, left:right], part)
+    low, high = (170.0, 40.0) if dark else (60.0, 200.0)
+    level = low + (high - low) * cv2.GaussianBlur(cover, (0, 0), blur)
+    level *= 1.0 + 0.001 * np.arange(size[0])  # light from the right
+    return np.clip(np.rint(level + np.random.default_rng(seed).normal(0, noise, level.shape)), 0, 255).astype(np.uint8)

@@ -1,0 +1,203 @@
+"""What a stranger gets wrong: every command answers in one line, with exit code 2, and writes nothing."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import h5py
+import numpy as np
+import pytest
+from support import Run, assert_refused, picture
+
+from calibration.camera import OrthographicCamera, Plane
+from calibration.rig import Rig, write_rig
+from capture.build import CaptureSettings, RecordingRow, build_dataset
+from capture.motion import tip_load_release
+from capture.specimen import Specimen
+from rafl.dataset import Dataset, write_dataset
+
+COMMANDS = ("rafl-render", "rafl-calibrate", "rafl-track", "rafl-capture", "rafl-fit", "rafl-eval")
+
+
+def folder_content(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_has_an_example(command: str, run: Run) -> None:
+    result = run(command, "--help")
+    assert result.returncode == 0
+    assert f"Example: {command} " in " ".join(result.stdout.split())
+
+
+@pytest.fixture
+def videos(tmp_path: Path) -> Path:
+    """One recording of one camera, as a folder of pictures: a 4 x 3 grid of dots that shifts a little."""
+    folder = tmp_path / "videos" / "swing"
+    folder.mkdir(parents=True)
+    for frame in range(6):
+        dots = [(40 + 36 * i + frame, 40 + 36 * j, 6.0, 6.0, 0.0) for i in range(4) for j in range(3)]
+        cv2.imwrite(str(folder / f"{frame:03d}.png"), picture(dots, noise=1.0, seed=frame))
+    write_rig(tmp_path / "calib.yaml", Rig({"front": camera()}))
+    return tmp_path / "videos"
+
+
+def camera(size: tuple[int, int] = (200, 160)) -> OrthographicCamera:
+    return OrthographicCamera(
+        size, (1e4, 1e4), 0.0, (0.0, 0.0, 0.0), (0.0, 0.0), plane=Plane((0.0, 0.0, 1.0), 0.0, 5e-4)
+    )
+
+
+def test_tracking_a_folder_of_pictures(videos: Path, run: Run, tmp_path: Path) -> None:
+    result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--overlay")
+    assert result.returncode == 0, result.stderr
+    with h5py.File(tmp_path / "tracks/swing.h5") as file:
+        assert list(file.attrs["marker_names"]) == [f"r{j}c{i}" for j in (1, 2, 3) for i in (1, 2, 3, 4)]
+        np.testing.assert_allclose(file["time"][()], np.arange(6) / 50)
+        moved = file["position"][5] - file["position"][0]
+        np.testing.assert_allclose(moved, np.broadcast_to([5e-4, 0, 0], moved.shape), atol=5e-6)
+        assert (file["state"][()] == 1).all()
+    assert (tmp_path / "tracks/swing_front_overlay.mp4").stat().st_size > 1000
+
+
+def test_tracking_refuses(videos: Path, run: Run, tmp_path: Path) -> None:
+    before = folder_content(tmp_path)
+
+    def refused(*parts: str, calib: str = "calib.yaml", path: Path = videos, more: tuple[str, ...] = ()) -> None:
+        result = run("rafl-track", path, "--calib", calib, *(more or ("--fps", "50")))
+        assert_refused(result, *parts)
+        assert folder_content(tmp_path) - set(extra) == before
+
+    extra = {"other.yaml", "videos/swing/broken.png"}
+    refused("nowhere.yaml", "check the path", calib="nowhere.yaml")
+    refused("nothing", path=tmp_path / "nothing")
+    write_rig(tmp_path / "other.yaml", Rig({"front": camera((640, 480))}))
+    refused("swing", "expected 640 x 480", "found 200 x 160", calib="other.yaml")
+    write_rig(tmp_path / "other.yaml", Rig({"left": camera(), "right": camera()}))
+    refused("other.yaml (left, right)", "'swing'", calib="other.yaml")
+    (tmp_path / "other.yaml").write_text("cameras: []")
+    refused("other.yaml", calib="other.yaml")
+    refused("--fps", more=("--fill", "3"))
+    (videos / "swing" / "broken.png").write_bytes(b"no picture")
+    refused("broken.png", "cannot be read")
+
+
+def test_too_few_markers_are_refused(videos: Path, run: Run, tmp_path: Path) -> None:
+    for path in (videos / "swing").iterdir():
+        cv2.imwrite(str(path), picture([(60.0, 60.0, 6.0, 6.0, 0.0), (120.0, 60.0, 6.0, 6.0, 0.0)], noise=1.0))
+    result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50")
+    assert_refused(result, "swing", "at least 3 dots", "found 2")
+    assert not (tmp_path / "tracks").exists()
+
+
+def test_one_failed_recording_does_not_stop_the_others(videos: Path, run: Run, tmp_path: Path) -> None:
+    blank = videos / "blank"
+    blank.mkdir()
+    for frame in range(3):
+        cv2.imwrite(str(blank / f"{frame}.png"), np.full((160, 200), 90, np.uint8))
+    result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50")
+    assert result.returncode == 1
+    assert "error: recording blank" in result.stderr
+    assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["swing.h5"]
+
+
+@pytest.fixture(scope="module")
+def built(small_specimen: Specimen, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("arrays")
+    return build_dataset(small_specimen, authors_arrays(small_specimen, folder), ROWS, SETTINGS, "", lambda: None)
+
+
+SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0, None, True)
+ROWS = [
+    RecordingRow(recording="q0", load_g=50, split="train"),
+    RecordingRow(recording="q1", load_g=70, split="test"),
+]
+
+
+def authors_arrays(specimen: Specimen, folder: Path) -> Path:
+    import torch
+
+    markers = specimen.markers(1e-6)
+    for row in ROWS:
+        motion = tip_load_release(specimen, specimen.material, 1e-3 * row.load_g, 5, 100.0)
+        moving = markers.positions(torch.from_numpy(motion.q)).numpy()
+        np.save(folder / f"{row.recording}.npy", 1e3 * np.concatenate([specimen.layout.positions[None], moving]))
+    return folder
+
+
+def test_capture_refuses(small_specimen: Specimen, specimen_file: Path, run: Run, tmp_path: Path) -> None:
+    authors_arrays(small_specimen, tmp_path)
+    table = tmp_path / "recordings.csv"
+    table.write_text("recording,load_g,split\nq0,50,train\nq1,70,test\n")
+
+    def capture(*more: str) -> object:
+        return run("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5", *more)
+
+    def refused(*parts: str) -> None:
+        result = run("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
+        assert_refused(result, *parts)
+        assert not list(tmp_path.glob("*a*.h5"))
+
+    text = specimen_file.read_text()
+    specimen_file.write_text(text.replace("at_mm: [28, 0, 13]", "at_mm: [28, -4, 13]"))
+    refused("La2", "4.00 mm off", "at most 2 mm")
+    specimen_file.write_text(text)
+    table.write_text("recording,load_g,split\nq0,50,train\nq2,70,test\n")
+    refused("q2", "q2.h5, .c3d or .npy")
+    table.write_text("recording,load_g,split\n")
+    refused("recordings.csv", "at least one recording")
+    table.write_text("recording,load_g,split\nq0,50,test\n")
+    refused("split `train`")
+    table.unlink()
+    refused("recordings.csv", "found nothing")
+
+
+def test_a_failed_capture_leaves_the_old_dataset(
+    small_specimen: Specimen, specimen_file: Path, run: Run, tmp_path: Path
+) -> None:
+    authors_arrays(small_specimen, tmp_path)
+    table = tmp_path / "recordings.csv"
+    table.write_text("recording,load_g,split\nq0,50,train\n")
+    line = ("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
+    assert run(*line).returncode == 0
+    before = (tmp_path / "a.h5").read_bytes()
+    (tmp_path / "q0.npy").write_bytes(b"broken")
+    assert_refused(run(*line), "q0.npy", "cannot be read")
+    assert (tmp_path / "a.h5").read_bytes() == before
+
+
+def test_fit_and_eval_refuse(built: Dataset, run: Run, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "a.h5", built)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file.attrs["format"] = "rafl-dataset/7"
+    assert_refused(run("rafl-fit", "a.h5", "--out", "run"), "rafl-dataset/7", "newer")
+    write_dataset(tmp_path / "a.h5", replace(built, trajectories={}))
+    assert_refused(run("rafl-fit", "a.h5", "--out", "run"), "at least one trajectory")
+    tests_only = {name: replace(item, split="test") for name, item in built.trajectories.items()}
+    write_dataset(tmp_path / "a.h5", replace(built, trajectories=tests_only))
+    assert_refused(run("rafl-fit", "a.h5", "--out", "run"), "split `train`")
+    assert_refused(run("rafl-fit", "nowhere.h5"), "nowhere.h5", "check the path")
+    assert not (tmp_path / "run").exists()
+    (tmp_path / "a.h5").write_bytes(b"not a dataset")
+    assert_refused(run("rafl-fit", "a.h5"), "a.h5", "cannot be read")
+
+    write_dataset(tmp_path / "a.h5", built)
+    assert_refused(run("rafl-eval", "a.h5"), "at least one run folder and one dataset")
+    assert_refused(run("rafl-eval", "nowhere", "a.h5"), "nowhere/model.pt")
+    done = run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1", "--frames", "3")
+    assert done.returncode == 0, done.stderr
+    assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1"), "already holds a run", "--resume")
+    assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--epochs", "2", "--resume"), "the settings")
+    (tmp_path / "run" / "model.pt").write_bytes(b"x")
+    assert_refused(run("rafl-eval", "run", "a.h5"), "model.pt", "cannot be read")
+    assert not (tmp_path / "run" / "errors.csv").exists()
+
+
+def test_render_refuses(specimen_file: Path, run: Run, tmp_path: Path) -> None:
+    assert_refused(run("rafl-render", "nowhere.yaml", "--out", "film"), "nowhere.yaml")
+    assert_refused(run("rafl-render", specimen_file, "--out", "film", "--loads-g", "5O"), "--loads-g", "'5O'")
+    assert_refused(run("rafl-render", specimen_file, "--out", "film", "--loads-g", ""), "at least one recording")
+    assert not (tmp_path / "film").exists()
+    (tmp_path / "film").mkdir()
+    (tmp_path / "film" / "thesis.txt").write_text("mine")
+    assert_refused(run("rafl-render", specimen_file, "--out", "film"), "found files in it")

@@ -1,0 +1,87 @@
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support import picture
+
+from groundwork import InputError
+from tracking.follow import Tracker, find_family, follow
+
+SIZE = (360, 240)
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Stands in for a video: dots drawn at given places."""
+
+    places: np.ndarray
+    path: Path = Path("drawn.mp4")
+    hidden: tuple[int, ...] = ()
+
+    def pictures(self) -> Iterator[tuple[float, np.ndarray]]:
+        for frame, places in enumerate(self.places):
+            shown = places[3:] if frame in self.hidden else places
+            yield (
+                0.01 * frame,
+                picture([(x, y, 6.0, 6.0, 0.0) for x, y in shown], SIZE, noise=2.0, seed=frame),
+            )
+
+
+def grid(columns: int = 8, rows: int = 3) -> np.ndarray:
+    x, y = np.meshgrid(40 + 34 * np.arange(columns), 80 + 34 * np.arange(rows))
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
+
+
+def bent(rest: np.ndarray, tip: np.ndarray) -> np.ndarray:
+    """The grid bent like a cantilever, its tip `tip` (T) px down."""
+    share = (rest[:, 0] - 20) / (rest[:, 0].max() - 20)
+    down = tip[:, None] * share**2 * (3 - share) / 2
+    return np.stack([np.broadcast_to(rest[:, 0], down.shape), rest[:, 1] + down], axis=-1)
+
+
+def order(tracks_start: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    return np.linalg.norm(truth[:, None] - tracks_start[None], axis=2).argmin(axis=1)
+
+
+@pytest.mark.parametrize("swing", [10.0, 20.0, 30.0])
+def test_no_dot_changes_its_identity(swing: float) -> None:
+    """Up to `swing` px of tip motion, up to three quarters of a spacing a frame, in a pattern of equal dots."""
+    rest = grid()
+    truth = bent(rest, swing * np.cos(2 * np.pi * np.arange(24) / 7.3))
+    tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
+    assert tracks.pixel.shape == truth.shape
+    found = tracks.pixel[:, order(tracks.start, truth[0])]
+    assert np.isfinite(found).mean() > 0.99
+    assert np.nanmax(np.linalg.norm(found - truth, axis=2)) < 0.3
+
+
+def test_hidden_dots_come_back_under_their_names() -> None:
+    rest = grid()
+    truth = bent(rest, 15.0 * np.sin(2 * np.pi * np.arange(20) / 16))
+    tracks = follow(Drawn(truth, hidden=tuple(range(6, 12))), lambda: None)  # type: ignore[arg-type]
+    found = tracks.pixel[:, order(tracks.start, truth[0])]
+    assert np.isnan(found[6:12, :3]).all()
+    assert np.abs(found[12:] - truth[12:]).max() < 0.3
+    assert np.abs(found[:, 3:] - truth[:, 3:]).max() < 0.3
+
+
+def test_the_family_is_the_dots_not_the_clutter() -> None:
+    """Six large blots and a row of small specks beside 24 dots of one size."""
+    rest = grid()
+    blots = [(30 + 50 * i, 30, 13.0, 10.0, 0.3) for i in range(6)]
+    specks = [(20 + 24 * i, 220, 3.0, 3.0, 0.0) for i in range(13)]
+    image = picture([*((x, y, 6.0, 6.0, 0.0) for x, y in rest), *blots, *specks], SIZE, noise=2.0)
+    found = find_family(image)
+    assert found is not None
+    family, dots = found
+    assert len(dots) == 24
+    assert family.dark
+    assert family.radius == pytest.approx(6.0, rel=0.05)
+    assert Tracker(family, dots).spacing == pytest.approx(34.0, abs=1.0)
+
+
+def test_too_few_dots_are_refused() -> None:
+    with pytest.raises(InputError, match=r"drawn\.mp4: expected at least 3 dots .* found 2"):
+        follow(Drawn(grid(2, 1)[None]), lambda: None)  # type: ignore[arg-type]

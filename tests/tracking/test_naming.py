@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibration.camera import OrthographicCamera
+from groundwork import InputError
+from tracking.layout import MarkerLayout
+from tracking.naming import name_by_layout, name_by_rows, visible_markers
+
+CAMERA = OrthographicCamera((1280, 720), (9000.0, 9000.0), 0.0, (np.pi / 2, 0.0, 0.0), (150.0, 400.0))
+
+
+def two_sided() -> MarkerLayout:
+    """16 markers on each side face of a beam, the sides mirror images of each other."""
+    names, places = [], []
+    for side, y in (("L", 0.0), ("R", 0.03)):
+        for row, z in enumerate((0.02, 0.01)):
+            for column in range(8):
+                names.append(f"{side}{row}{column}")
+                places.append((0.010 + 0.012 * column, y, z))
+    return MarkerLayout(tuple(names), np.array(places))
+
+
+LAYOUT = two_sided()
+
+
+def filmed(turn_deg: float = 0.0, bend: float = 0.0, shift: float = 0.0) -> np.ndarray:
+    """The left side's dots in the picture, bent down by `bend` m at the tip, then turned."""
+    places = LAYOUT.positions[:16].copy()
+    places[:, 2] -= bend * (places[:, 0] / 0.1) ** 2
+    places[:, 0] += shift
+    centre = places.mean(0)
+    turn = Rotation.from_rotvec([0, np.radians(turn_deg), 0]).as_matrix()
+    return CAMERA.project((places - centre) @ turn.T + centre)
+
+
+def test_only_the_near_side_is_seen() -> None:
+    assert CAMERA.viewing_direction == pytest.approx([0, 1, 0])
+    assert visible_markers(LAYOUT, CAMERA).tolist() == list(range(16))
+    one_plane = MarkerLayout(LAYOUT.names[:16], LAYOUT.positions[:16])
+    assert len(visible_markers(one_plane, CAMERA)) == 16
+
+
+@pytest.mark.parametrize(
+    ("turn", "bend", "shift"),
+    [(0, 0, 0), (0, 0.05, 0), (5, 0.03, 0.004), (90, 0.0, 0.0), (-150, 0.01, 0.0), (0, -0.06, 0.0)],
+)
+def test_dots_in_any_order_get_their_names(turn: float, bend: float, shift: float, random: np.random.Generator) -> None:
+    dots = filmed(turn, bend, shift)
+    mixed = random.permutation(16)
+    names = name_by_layout(dots[mixed], LAYOUT, CAMERA, "a video")
+    if abs(turn) < 90:
+        assert names == mixed.tolist()
+    else:  # a two-row grid looks the same upside down; each name still occurs once
+        assert sorted(names) == list(range(16))
+
+
+def test_missing_and_false_dots(random: np.random.Generator) -> None:
+    dots = filmed(bend=0.02)
+    kept = np.delete(np.arange(16), [3, 12])
+    names = name_by_layout(np.vstack([dots[kept], [[20.0, 30.0], [1200.0, 700.0]]]), LAYOUT, CAMERA, "a video")
+    assert names == [*kept.tolist(), -1, -1]
+
+
+def test_another_pattern_is_refused(random: np.random.Generator) -> None:
+    far_apart = np.array([[0.0, 0.0], [1200.0, 10.0], [600.0, 700.0], [10.0, 650.0]])
+    with pytest.raises(InputError, match="a video: expected dots in the pattern"):
+        name_by_layout(far_apart, LAYOUT, CAMERA, "a video")
+
+
+def test_rows_and_columns(random: np.random.Generator) -> None:
+    """A tilted grid with uneven columns is named in reading order."""
+    x, y = np.meshgrid([10.0, 90, 160, 260], [20.0, 130, 240])
+    dots = np.stack([x.ravel(), y.ravel() + 0.04 * x.ravel()], axis=1)
+    mixed = random.permutation(12)
+    names = name_by_rows(dots[mixed])
+    for place, dot in enumerate(mixed):
+        assert names[place] == f"r{dot // 4 + 1}c{dot % 4 + 1}"
