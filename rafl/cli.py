@@ -43,12 +43,12 @@ def fit(
     datasets: Annotated[list[Path], typer.Argument(help="Dataset files (.h5) to train on.", metavar="DATASET...")],
     method: Annotated[Method, typer.Option(help="rafl: residual field; sysid: E and nu.")] = Method.rafl,
     out: Annotated[Path | None, typer.Option(help="Run folder [runs/<dataset>-<method>].")] = None,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes over the recordings, at most.")] = 60,
-    learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start.")] = 2e-3,
-    weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's.")] = 1e-5,
-    patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping.")] = 20,
+    epochs: Annotated[int, typer.Option(min=1, help="Passes over the recordings (iterations of sysid), at most.")] = 60,
+    learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start (rafl).")] = 5e-3,
+    weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's (rafl).")] = 1e-5,
+    patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping (rafl).")] = 20,
     frames: Annotated[int, typer.Option(min=0, help="Leading frames to train on (0: all).")] = 0,
-    seed: Annotated[int, typer.Option(help="Of weights and order.")] = 0,
+    seed: Annotated[int, typer.Option(help="Of weights and order (rafl).")] = 0,
     resume: Annotated[bool, typer.Option(help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Train on the `train` recordings, watch the `val` ones, keep the best.

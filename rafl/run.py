@@ -136,6 +136,14 @@ def load_model(run: Path) -> FittedModel:
     return FittedModel("rafl", field=field)
 
 
+def read_history(run: Path) -> list[dict[str, float]]:
+    """The rows of `history.csv`; none where there is no such file yet."""
+    path = run / "history.csv"
+    if not path.exists():
+        return []
+    return [{str(key): float(value) for key, value in row.items()} for row in pd.read_csv(path).to_dict("records")]
+
+
 def write_history(run: Path, rows: list[dict[str, float]]) -> None:
     """Write `history.csv`, a row an epoch."""
     write_text(run / "history.csv", pd.DataFrame(rows).to_csv(index=False))

@@ -9,7 +9,7 @@ from scipy.optimize import minimize
 from rafl.dataset import Dataset
 from rafl.fit import Report, mean_error, shortened, training_recordings
 from rafl.objective import training_loss
-from rafl.run import FittedModel, Settings, save_model, write_history
+from rafl.run import FittedModel, Settings, read_history, save_model, write_history
 from rafl.simulator import SimulationError
 
 LOG_MODULUS = (np.log(2e4), np.log(1e7))
@@ -19,12 +19,14 @@ POISSON = (0.3, 0.499)
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
     """Fit (log E, nu) of the training recordings by L-BFGS-B from the datasets' assumed material.
 
+    Where `history.csv` stands in `run` already, the search goes on from its last row.
+
     Raises:
         InputError: no recording to train on.
         SimulationError: the assumed material itself cannot be simulated.
     """
     train, validate = training_recordings([shortened(dataset, settings.frames) for dataset in datasets])
-    history: list[dict[str, float]] = []
+    history = read_history(run)
     evaluations = 0
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -59,8 +61,11 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         report(row)
 
     assumed = datasets[0].simulator.material
-    start = np.array([np.log(assumed.youngs_modulus), min(assumed.poissons_ratio, POISSON[1])])
-    record(start)
+    first = {"youngs_modulus": assumed.youngs_modulus, "poissons_ratio": assumed.poissons_ratio}
+    last = history[-1] if history else first
+    start = np.array([np.log(last["youngs_modulus"]), np.clip(last["poissons_ratio"], *POISSON)])
+    if not history:
+        record(start)
 
     # Tenths of nu and of log E are of like effect; L-BFGS-B wants its variables so.
     scale = np.array([1.0, 0.1])
@@ -76,7 +81,7 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         method="L-BFGS-B",
         bounds=[LOG_MODULUS, (POISSON[0] / scale[1], POISSON[1] / scale[1])],
         callback=lambda y: record(y * scale),
-        options={"maxiter": settings.epochs, "ftol": 1e-8, "gtol": 1e-8},
+        options={"maxiter": max(settings.epochs - len(history) + 1, 0), "ftol": 1e-8, "gtol": 1e-8},
     )
     best = result.x * scale
     model = FittedModel("sysid", material=(float(np.exp(best[0])), float(best[1])))

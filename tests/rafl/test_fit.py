@@ -66,6 +66,15 @@ def test_system_identification_finds_the_true_material(dataset: Dataset, tmp_pat
     assert load_model(tmp_path).material == model.material
 
 
+def test_an_interrupted_identification_goes_on(dataset: Dataset, tmp_path: Path) -> None:
+    settings = replace(SETTINGS, method="sysid", epochs=2)
+    identify_material([dataset], settings, tmp_path, silent)
+    rows: list[dict[str, float]] = []
+    identify_material([dataset], replace(settings, epochs=5), tmp_path, rows.append)
+    assert [row["epoch"] for row in rows] == [3, 4, 5][: len(rows)]
+    assert rows[-1]["loss"] < 0.5 * rows[0]["loss"] or rows[-1]["loss"] < 1e-4
+
+
 def test_nothing_to_train_on_is_refused(dataset: Dataset) -> None:
     items = {name: replace(item, split="test") for name, item in dataset.trajectories.items()}
     with pytest.raises(InputError, match="split `train`"):
