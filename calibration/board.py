@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, field_validator
+from scipy.spatial import cKDTree
 
 from groundwork import InputError, StrictModel, check_format, read_yaml
 
@@ -68,10 +69,16 @@ class CharucoPattern(StrictModel):
         """Board points (P, 2) [m] and their pixels (P, 2) in a grey image."""
         board = self.opencv_board()
         corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
-        if ids is None or not len(ids):
+        if ids is None or len(ids) < FEWEST_POINTS:
             return np.zeros((0, 2)), np.zeros((0, 2))
         points = np.asarray(board.getChessboardCorners(), dtype=float)[ids.ravel(), :2]
-        return points, np.asarray(corners, dtype=float).reshape(-1, 2)
+        # OpenCV 4 counts these corners from a pixel's edge, OpenCV 5 from its centre: refined here, they
+        # are from the centre in both.
+        apart = cKDTree(corners.reshape(-1, 2)).query(corners.reshape(-1, 2), 2)[0][:, 1].min()
+        half = int(np.clip(0.15 * apart, 2, 10))
+        stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
+        refined = cv2.cornerSubPix(image, np.array(corners, dtype=np.float32), (half, half), (-1, -1), stop)
+        return points, np.asarray(refined, dtype=float).reshape(-1, 2)
 
 
 class DotGridPattern(StrictModel):

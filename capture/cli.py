@@ -125,9 +125,11 @@ def _splits(motions: list[Motion]) -> str:
 @user_command
 def capture(
     specimen: Annotated[Path, typer.Argument(help="Specimen description (specimen.yaml).")],
-    tracks: Annotated[Path, typer.Argument(help="Folder of tracks (.h5), motion capture (.c3d) or q<i>.npy.")],
+    tracks: Annotated[
+        Path, typer.Argument(help="Folder of tracks (.h5), motion capture (.c3d) or q0.npy, q1.npy, ...")
+    ],
     recordings: Annotated[Path, typer.Option(help="Table of recordings: recording,load_g,split.")],
-    out: Annotated[Path | None, typer.Option(help="Dataset to write [datasets/<specimen>.h5].")] = None,
+    out: Annotated[Path | None, typer.Option(help="Dataset to write [datasets/SPECIMEN.h5].")] = None,
     tolerance_mm: Annotated[float, typer.Option(min=0.0, help="Markers may stand this far off the skin.")] = 2.0,
     fit_tolerance_mm: Annotated[float, typer.Option(min=0.0, help="Registration may be this far off.")] = 3.0,
     rest: Annotated[str | None, typer.Option(help="RECORDING:FRAME in which the specimen is undeformed.")] = None,

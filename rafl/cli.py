@@ -42,7 +42,7 @@ def _simulating(error: SimulationError) -> typer.Exit:
 def fit(
     datasets: Annotated[list[Path], typer.Argument(help="Dataset files (.h5) to train on.", metavar="DATASET...")],
     method: Annotated[Method, typer.Option(help="rafl: residual field; sysid: E and nu.")] = Method.rafl,
-    out: Annotated[Path | None, typer.Option(help="Run folder [runs/<dataset>-<method>].")] = None,
+    out: Annotated[Path | None, typer.Option(help="Run folder [runs/DATASET-METHOD].")] = None,
     epochs: Annotated[int, typer.Option(min=1, help="Passes over the recordings (iterations of sysid), at most.")] = 60,
     learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start (rafl).")] = 5e-3,
     weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's (rafl).")] = 1e-5,

@@ -46,6 +46,9 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     Raises:
         InputError: a video without enough markers or of unknown rate, or one that cannot be decoded.
     """
+    for video in videos.values():
+        if settings.fps is None and video.path.is_dir():
+            raise InputError(f"{video.path}: a folder of pictures has no times; give the true rate with --fps")
     followed = {camera: follow(video, tick) for camera, video in videos.items()}
     frames = min(len(item.time) for item in followed.values())
     time = _time(followed, videos, settings.fps, frames)
@@ -93,8 +96,8 @@ def _time(followed: dict[str, PixelTracks], videos: dict[str, Video], fps: float
         time = item.time[:frames]
         if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
             raise InputError(
-                f"{videos[camera].path}: expected a time for every frame, found none (a folder of pictures "
-                "has none); give the true rate with --fps"
+                f"{videos[camera].path}: expected a later time with every frame, found another; give the true "
+                "rate with --fps"
             )
         clocks[camera] = time
     first = next(iter(clocks.values()))

@@ -13,7 +13,7 @@ from pathlib import Path
 import pandas as pd
 
 SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
-EPOCHS = 30
+EPOCHS = 25
 
 
 def command(name: str, *arguments: object) -> None:
