@@ -81,7 +81,7 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         method="L-BFGS-B",
         bounds=[LOG_MODULUS, (POISSON[0] / scale[1], POISSON[1] / scale[1])],
         callback=lambda y: record(y * scale),
-        options={"maxiter": max(settings.epochs - len(history) + 1, 0), "ftol": 1e-6, "gtol": 1e-6},
+        options={"maxiter": max(settings.epochs - len(history) + 1, 0), "ftol": 1e-7, "gtol": 1e-6},
     )
     best = result.x * scale
     model = FittedModel("sysid", material=(float(np.exp(best[0])), float(best[1])))
