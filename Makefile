@@ -6,7 +6,7 @@ SHARED ?= ../shared
 # BLAS threads fight the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test lint slow real real-beam clean
+.PHONY: install demo test lint real real-beam clean
 
 install: $(VENV)/installed
 
@@ -32,9 +32,6 @@ lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
-
-slow: install
-	$(BIN)/pytest -m slow
 
 # What needs the recordings and trajectories beside the checkout; skipped where they are absent.
 real: install

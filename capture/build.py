@@ -129,6 +129,13 @@ def build_dataset(
         rigid = _registration(item, specimen, clamp, rest_fit, settings, row.recording)
         time, position, sigma = _on_grid(item, rigid, len(specimen.layout.names), step, row)
         initial = fit_first_frame(simulator, markers, specimen.loaded, position[0], sigma[0], row.recording)
+        if initial.residual > settings.fit_tolerance:
+            raise InputError(
+                f"recording {row.recording}: expected a first frame the specimen can be bent into, found its "
+                f"markers {1e3 * initial.residual:.2f} mm off (root mean square; at most "
+                f"{1e3 * settings.fit_tolerance:g} mm); check that the calibration's world is the specimen's frame, "
+                "or allow it with --fit-tolerance-mm"
+            )
         load = 1e-3 * row.load_g if row.load == "hanging" else 0.0
         added = np.zeros(len(specimen.mesh.vertices))
         added[specimen.loaded] = load / len(specimen.loaded)

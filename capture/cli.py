@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from capture.build import CaptureSettings, build_dataset, read_recording_rows
-from capture.film import CODECS, film, side_cameras, write_board_images, write_truth
+from capture.film import ENCODINGS, film, side_cameras, write_board_images, write_truth
 from capture.motion import Motion, tip_load_release, twist_release
 from capture.render import Look, Painter
 from capture.specimen import read_specimen
@@ -97,7 +97,7 @@ def render(
         task = bar.add_task("filming", total=frames * len(motions) * len(painters))
         for number, motion in enumerate(motions):
             for view, (name, painter) in enumerate(painters.items()):
-                path = out / "videos" / motion.name / f"{name}.{CODECS[codec.value][0]}"
+                path = out / "videos" / motion.name / f"{name}.{ENCODINGS[codec.value].suffix}"
                 film(
                     path,
                     motion,

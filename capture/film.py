@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -31,10 +31,23 @@ IMAGE_SIZE = (1280, 720)
 MARGIN = 1.12  # picture over the space the motion sweeps
 BOARD_MM = (10.0, 7.5)  # square, marker
 BOARD_VIEWS = 12
-CODECS = {
-    "h264": ("mp4", "libx264", "yuv420p", {"crf": "14", "preset": "veryfast"}),
-    "ffv1": ("mkv", "ffv1", "gray", {}),
-    "mjpeg": ("avi", "mjpeg", "yuvj420p", {"qmin": "2", "qmax": "3"}),
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How a video file is written: its suffix, FFmpeg's names of muxer, encoder and pixels, and options."""
+
+    suffix: str
+    muxer: str
+    encoder: str
+    pixels: str
+    options: dict[str, str]
+
+
+ENCODINGS = {
+    "h264": Encoding("mp4", "mp4", "libx264", "yuv420p", {"crf": "14", "preset": "veryfast"}),
+    "ffv1": Encoding("mkv", "matroska", "ffv1", "gray", {}),
+    "mjpeg": Encoding("avi", "avi", "mjpeg", "yuvj420p", {"qmin": "2", "qmax": "3"}),
 }
 # Axes of each camera in the world: right, down and forward in the picture.
 VIEWS = {
@@ -83,16 +96,16 @@ def film(
     """Film a motion through one camera into a video file.
 
     Args:
-        path: of the video, its suffix that of the codec in `CODECS`.
+        path: of the video, its suffix that of the encoding.
         motion: what moves.
         painter: what it looks like.
         fps: frames per second.
-        codec: key of `CODECS`.
+        codec: key of `ENCODINGS`.
         seed: of the sensor noise.
         tick: called after every frame.
     """
-    container, encoder, pixels, options = CODECS[codec]
-    full_range = not pixels.startswith("yuv420p")
+    encoding = ENCODINGS[codec]
+    levels = "MPEG" if encoding.pixels == "yuv420p" else "JPEG"
 
     def draw(frame: int) -> NDArray[np.uint8]:
         random = np.random.default_rng((seed, frame))
@@ -103,20 +116,17 @@ def film(
             for start in range(0, len(motion.q), 8):
                 yield from pool.map(draw, range(start, min(start + 8, len(motion.q))))
 
-    with whole_file(path) as temporary, av.open(str(temporary), "w", format=_MUXERS[container]) as output:
+    with whole_file(path) as temporary, av.open(str(temporary), "w", format=encoding.muxer) as output:
         rate = Fraction(fps).limit_denominator(10000)
-        stream = output.add_stream(encoder, rate=rate)
+        stream = output.add_stream(encoding.encoder, rate=rate)
         stream.width, stream.height = painter.camera.image_size
-        stream.pix_fmt, stream.options = pixels, options
+        stream.pix_fmt, stream.options = encoding.pixels, encoding.options
         for picture in pictures():
             frame = av.VideoFrame.from_ndarray(picture, format="gray")
-            frame = frame.reformat(format=pixels, dst_color_range="JPEG" if full_range else "MPEG")
+            frame = frame.reformat(format=encoding.pixels, dst_color_range=levels)
             output.mux(stream.encode(frame))
             tick()
         output.mux(stream.encode())
-
-
-_MUXERS = {"mp4": "mp4", "mkv": "matroska", "avi": "avi"}
 
 
 def write_board_images(folder: Path, rig: Rig, look: Look, random: np.random.Generator) -> None:

@@ -56,6 +56,8 @@ def fit(
     Example: rafl-fit datasets/thick.h5 --out runs/thick
     """
     torch.set_num_threads(TORCH_THREADS)
+    if frames == 1:
+        raise InputError("--frames: expected 0 (all) or at least 2, found 1")
     loaded = [read_dataset(path) for path in datasets]
     run = out or Path("runs") / f"{loaded[0].name}-{method.value}"
     settings = Settings(
@@ -70,7 +72,7 @@ def fit(
         def report(row: dict[str, float]) -> None:
             bar.update(task, completed=row["epoch"])
             values = ", ".join(f"{key} {value:.5g}" for key, value in row.items() if key != "epoch")
-            bar.console.print(f"epoch {row['epoch']:3.0f}: {values}", highlight=False)
+            bar.console.print(f"epoch {row['epoch']:3.0f}: {values}", highlight=False, soft_wrap=True)
 
         try:
             method_of = fit_residual_field if method is Method.rafl else identify_material

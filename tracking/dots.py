@@ -152,13 +152,15 @@ def _fit_disc(image, p, reach, dots_near, out):  # type: ignore[no-untyped-def]
                 break
         A = kept.copy()
         for i in range(n):
-            A[i, i] += damping * kept[i, i] + 1e-12
+            A[i, i] += (damping + 1e-10) * kept[i, i] + 1e-12
+        if not np.isfinite(A).all():
+            return False
         step = np.linalg.solve(A, kept_b)
         for i in range(n):
             trial[i] = p[i] + step[i]
         trial[5] = min(max(trial[5], 0.15), 4.0)
     for i in range(n):
-        kept[i, i] += 1e-12
+        kept[i, i] += 1e-10 * kept[i, i] + 1e-12
     inverse = np.linalg.inv(kept)
     noise = best / (count - n)
     out[0] = 0.5 * noise * (inverse[0, 0] + inverse[1, 1])

@@ -13,6 +13,7 @@ from capture.specimen import Specimen
 from groundwork import InputError
 from rafl.dataset import Dataset
 from tracking.layout import MarkerLayout
+from tracking.tracks import Tracks, write_tracks
 
 SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0, None, True)
 FRAMES = 8
@@ -93,6 +94,29 @@ def test_a_rest_frame_registers_files_without_a_clamp(
     settings = replace(SETTINGS, rest=("q0", 0))
     item = build(small_specimen, tmp_path, settings, first_frame=1).trajectories["q0"]
     np.testing.assert_allclose(item.markers, truth[1:], atol=1e-6)
+
+
+def test_tracks_are_taken_as_they_are_unless_they_cannot_be(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    """The calibration's world is the specimen's frame; 20 mm off, no bending explains the markers."""
+    moving = truth[1:]
+    whole = np.ones(moving.shape[:2])
+
+    def write(position: np.ndarray) -> None:
+        time, sigma = 0.01 * np.arange(FRAMES), np.full_like(position, 1e-5)
+        state = whole.astype(np.uint8)
+        tracks = Tracks(
+            small_specimen.layout.names, time, position, sigma, state, {}, {}, {}, 100.0, "", {"v.mp4": "0"}, ""
+        )
+        write_tracks(tmp_path / "q0.h5", tracks)
+
+    write(moving)
+    item = build(small_specimen, tmp_path).trajectories["q0"]
+    np.testing.assert_array_equal(item.markers, moving)
+    write(moving + np.array([0.0, 0.02, 0.0]))
+    with pytest.raises(InputError, match="world is the specimen's frame"):
+        build(small_specimen, tmp_path)
 
 
 def test_gaps_and_chosen_frames(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
