@@ -21,6 +21,7 @@ NEIGHBOURS = 6
 GATE = 0.45  # of the dot spacing: how far from its prediction a dot may be
 CALM = 0.2  # of the dot spacing: motion and surprise in a frame below which looking nearby is safe
 SHARES = (1.0, 0.5, 0.0, -0.5, -1.0)  # of the last velocity, tried when the motion is not calm
+SHARP = 0.08  # px: a localisation error that a printed dot stays under
 FAR = 0.15  # of a marker: what a jump of one spacing costs
 
 
@@ -72,12 +73,13 @@ class PixelTracks:
 
 
 def find_family(image: NDArray[np.uint8]) -> tuple[Family, Dots] | None:
-    """The markers of a picture: the largest set of well-fitted dots alike in size and contrast."""
+    """The markers of a picture: the largest set of well-located dots alike in size and contrast."""
     best: tuple[float, Family, Dots] | None = None
     for dark in (True, False):
         dots = find_dots(image, dark)
         dots = dots[(dots.residual < 0.15) & (dots.flattening > 0.6)]
-        quality = np.clip(1.0 - dots.residual / 0.15, 0.0, 1.0) * np.minimum(np.abs(dots.contrast) / 60.0, 1.0)
+        # A printed dot is located ten times as well as a blot that happens to be round.
+        quality = 1.0 / (1.0 + (dots.sigma / SHARP) ** 2) ** 2
         for seed in range(len(dots)):
             alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2)
             alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)

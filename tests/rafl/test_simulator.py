@@ -21,6 +21,11 @@ def shaken(simulator: Simulator, random: np.random.Generator, size: float = 2e-3
     return q[None]
 
 
+def slope_of_gradient(simulator: Simulator, q: np.ndarray, direction: np.ndarray, h: float = 1e-6) -> np.ndarray:
+    up, down = (simulator.elastic_gradient(q + sign * h * direction, MU, LAM) for sign in (1, -1))
+    return (up - down) / (2 * h)
+
+
 def test_no_force_under_rigid_motion_and_equivariance(random: np.random.Generator) -> None:
     simulator = beam()
     turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()

@@ -2,6 +2,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from support import picture
@@ -80,6 +81,24 @@ def test_the_family_is_the_dots_not_the_clutter() -> None:
     assert family.dark
     assert family.radius == pytest.approx(6.0, rel=0.05)
     assert Tracker(family, dots).spacing == pytest.approx(34.0, abs=1.0)
+
+
+def test_the_family_is_not_the_background() -> None:
+    """Twelve dots on a bright skin before a mottled wall that is full of round blots."""
+    random = np.random.default_rng(2)
+    wall = np.full((480, 640), 70.0)
+    for size, strength in ((120, 35.0), (30, 25.0), (6, 12.0)):
+        coarse = random.normal(0.0, strength, (480 // size + 2, 640 // size + 2))
+        wall += cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
+    wall = np.clip(wall + random.normal(0, 3, wall.shape), 0, 255).astype(np.uint8)
+    skin = picture([(x, y, 9.0, 9.0, 0.0) for x, y in grid(6, 2)], (260, 150), noise=3.0)
+    wall[160:310, 200:460] = skin
+    found = find_family(wall)
+    assert found is not None
+    dots = found[1]
+    assert len(dots) == 12
+    distance = np.linalg.norm(dots.centre[:, None] - (grid(6, 2) + np.array([200, 160]))[None], axis=2)
+    assert distance.min(axis=1).max() < 0.2
 
 
 def test_too_few_dots_are_refused() -> None:
