@@ -35,7 +35,7 @@ class StrictModel(pydantic.BaseModel):
 
 
 def user_command(command: Command) -> Command:
-    """Turn an `InputError` into one line on standard error and exit code 2."""
+    """Turn an `InputError`, or a file system's refusal, into one line on standard error and exit code 2."""
 
     @functools.wraps(command)
     def wrapped(*args: Any, **kwargs: Any) -> Any:
@@ -43,6 +43,10 @@ def user_command(command: Command) -> Command:
             return command(*args, **kwargs)
         except InputError as error:
             typer.echo(f"error: {error}", err=True)
+            raise typer.Exit(2) from None
+        except OSError as error:
+            where = error.filename or "a file"
+            typer.echo(f"error: {where}: {error.strerror or error}; check the path, its rights and the disk", err=True)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
             typer.echo("stopped; nothing half-written was left behind", err=True)
@@ -114,11 +118,12 @@ def require_file(path: Path, what: str) -> Path:
     return path
 
 
-def read_yaml(path: Path, model: type[Model], what: str) -> Model:
-    """Read and validate a YAML file a person wrote.
+def read_yaml(path: Path, model: type[Model], what: str, version: str) -> Model:
+    """Read and validate a YAML file a person wrote, of format `version` (`name/number`).
 
     Raises:
-        InputError: no such file, not YAML, an unknown or missing key, a value of another kind.
+        InputError: no such file, not YAML, of another format or a newer version, an unknown or missing
+            key, a value of another kind.
     """
     require_file(path, what)
     try:
@@ -127,7 +132,8 @@ def read_yaml(path: Path, model: type[Model], what: str) -> Model:
         reason = " ".join(str(error).split())
         raise InputError(f"expected {what} in {path}, which is not readable as YAML: {reason}") from None
     if not isinstance(content, dict):
-        raise InputError(f"expected {what} (keys and values) in {path}, found {type(content).__name__}")
+        raise InputError(f"expected {what} in {path}, found no keys and values; is it the right file?")
+    check_format(str(content.get("format", "no `format:`")), version, path)
     try:
         return model.model_validate(content)
     except pydantic.ValidationError as error:

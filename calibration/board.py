@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 from scipy.spatial import cKDTree
 
-from groundwork import InputError, StrictModel, check_format, read_yaml
+from groundwork import InputError, StrictModel, read_yaml
 
 Array = NDArray[Any]
 
@@ -136,9 +136,7 @@ def read_board(path: Path) -> BoardFile:
     Raises:
         InputError: missing, damaged, or of a newer version.
     """
-    board = read_yaml(path, BoardFile, "a board description (board.yaml)")
-    check_format(board.format, FORMAT, path)
-    return board
+    return read_yaml(path, BoardFile, "a board description (board.yaml)", FORMAT)
 
 
 def find_board(path: Path, name: str, board: BoardFile) -> tuple[View | None, tuple[int, int]]:

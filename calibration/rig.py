@@ -9,7 +9,7 @@ import yaml
 from pydantic import Field, field_validator
 
 from calibration.camera import OrthographicCamera, Plane
-from groundwork import StrictModel, check_format, read_yaml, write_text
+from groundwork import StrictModel, read_yaml, write_text
 
 FORMAT = "rafl-calibration/1"
 PLANE_SIGMA_MM = 0.5
@@ -74,8 +74,7 @@ def read_rig(path: Path) -> Rig:
     Raises:
         InputError: missing, damaged, or of a newer version.
     """
-    content = read_yaml(path, _RigFile, "a calibration (calib.yaml)")
-    check_format(content.format, FORMAT, path)
+    content = read_yaml(path, _RigFile, "a calibration (calib.yaml)", FORMAT)
     return Rig({name: _camera(entry) for name, entry in content.cameras.items()})
 
 

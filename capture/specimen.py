@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, model_validator
 
-from groundwork import InputError, StrictModel, check_format, read_yaml
+from groundwork import InputError, StrictModel, read_yaml
 from rafl.markers import Markers, embed, embedding_gap
 from rafl.material import Material
 from rafl.mesh import HexMesh
@@ -109,8 +109,7 @@ def read_specimen(path: Path) -> Specimen:
     Raises:
         InputError: missing, damaged, or of a newer version.
     """
-    content = read_yaml(path, _SpecimenFile, "a specimen (specimen.yaml)")
-    check_format(content.format, SPECIMEN_FORMAT, path)
+    content = read_yaml(path, _SpecimenFile, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
     size = 1e-3 * np.array(content.geometry.box_mm)
     cells = np.round(np.array(content.geometry.box_mm) / content.geometry.element_mm).astype(int)
     mesh = HexMesh.box(cells, size)

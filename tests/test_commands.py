@@ -184,6 +184,7 @@ def test_fit_and_eval_refuse(built: Dataset, run: Run, tmp_path: Path) -> None:
     write_dataset(tmp_path / "a.h5", built)
     assert_refused(run("rafl-eval", "a.h5"), "at least one run folder and one dataset")
     assert_refused(run("rafl-eval", "nowhere", "a.h5"), "nowhere/model.pt")
+    assert_refused(run("rafl-fit", "a.h5", "--out", "a.h5/run"), "a.h5", "check the path")
     done = run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1", "--frames", "3")
     assert done.returncode == 0, done.stderr
     assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1"), "already holds a run", "--resume")

@@ -6,6 +6,7 @@ from groundwork import InputError, StrictModel, check_format, read_yaml, sha256,
 
 
 class Thing(StrictModel):
+    format: str
     length_mm: float
 
 
@@ -37,17 +38,20 @@ def test_a_whole_write_replaces_the_file(tmp_path: Path) -> None:
     ("text", "part"),
     [
         ("length_mm: [", "not readable as YAML"),
-        ("- 1", "found list"),
-        ("length_m: 3", "length_mm: Field required"),
-        ("length_mm: long", "found 'long'"),
-        ("{length_mm: 1, width: 2}", "width"),
+        ("- 1", "no keys and values"),
+        ("length_mm: 1", "rafl-thing/1"),
+        ("format: rafl-other/1", "rafl-other/1"),
+        ("format: rafl-thing/2", "newer"),
+        ("format: rafl-thing/1\nlength_m: 3", "length_mm: Field required"),
+        ("format: rafl-thing/1\nlength_mm: long", "found 'long'"),
+        ("{format: rafl-thing/1, length_mm: 1, width: 2}", "width"),
     ],
 )
 def test_yaml_errors_name_file_and_key(tmp_path: Path, text: str, part: str) -> None:
     path = tmp_path / "thing.yaml"
     path.write_text(text)
     with pytest.raises(InputError, match=r"thing\.yaml") as error:
-        read_yaml(path, Thing, "a thing")
+        read_yaml(path, Thing, "a thing", "rafl-thing/1")
     assert part in str(error.value)
     assert "\n" not in str(error.value)
 

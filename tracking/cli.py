@@ -1,6 +1,7 @@
 """The command `rafl-track`."""
 
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -54,7 +55,10 @@ def track(
             write_tracks(out / f"{name}.h5", done[name])
             if overlay:
                 for camera, video in recordings[name].items():
-                    write_overlay(out / f"{name}_{camera}_overlay.mp4", video, camera, done[name])
+                    task = bar.add_task(f"{name}: drawing {camera}", total=len(done[name].time))
+                    path = out / f"{name}_{camera}_overlay.mp4"
+                    write_overlay(path, video, camera, done[name], partial(bar.advance, task))
+                    bar.remove_task(task)
     if not done:
         first = next(iter(failed))
         raise InputError(f"recording {first}: {failed[first]}")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
-from groundwork import StrictModel, check_format, read_yaml
+from groundwork import StrictModel, read_yaml
 
 SPECIMEN_FORMAT = "rafl-specimen/1"
 
@@ -60,6 +60,5 @@ def read_layout(path: Path) -> MarkerLayout:
     Raises:
         InputError: missing, damaged, or of a newer version.
     """
-    content = read_yaml(path, MarkerEntries, "a specimen (specimen.yaml)")
-    check_format(content.format, SPECIMEN_FORMAT, path)
+    content = read_yaml(path, MarkerEntries, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
     return MarkerLayout.of(content.markers)

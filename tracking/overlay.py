@@ -1,5 +1,6 @@
 """A video with every marker's name and trail drawn over the picture, to look at."""
 
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -16,8 +17,11 @@ COLOUR, FILLED_COLOUR = (90, 255, 90), (255, 170, 40)
 WIDEST = 1280
 
 
-def write_overlay(path: Path, video: Video, camera: str, tracks: Tracks) -> None:
-    """Write an H.264 video of one camera's view with names, trails and filled markers in orange."""
+def write_overlay(path: Path, video: Video, camera: str, tracks: Tracks, tick: Callable[[], None]) -> None:
+    """Write an H.264 video of one camera's view with names, trails and filled markers in orange.
+
+    `tick` is called after every frame.
+    """
     shrink = min(1.0, WIDEST / max(video.size))
     width, height = (int(side * shrink) // 2 * 2 for side in video.size)
     pixel = tracks.pixel[camera] * shrink
@@ -40,4 +44,5 @@ def write_overlay(path: Path, video: Video, camera: str, tracks: Tracks) -> None
                     place = (x + 6, y - 8)
                     cv2.putText(picture, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
             output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+            tick()
         output.mux(stream.encode())
