@@ -78,7 +78,7 @@ def _marker_plot(item: Comparison) -> str:
         axes.plot(item.time, 1e3 * markers[:, marker, axis], color=colour, label=method)
     axes.set(xlabel="time [s]", ylabel=f"{'xyz'[axis]} of {item.marker_names[marker]} [mm]")
     axes.set_title(f"{item.dataset} / {item.recording} ({item.split})")
-    axes.legend(loc="upper right")
+    axes.legend(loc="best")
     return _png(figure)
 
 

@@ -12,12 +12,17 @@ from rafl.objective import training_loss
 from rafl.run import FittedModel, Settings, read_history, save_model, write_history
 from rafl.simulator import SimulationError
 
-LOG_MODULUS = (np.log(2e4), np.log(1e7))
+MODULUS = (2e4, 1e7)  # Pa
 POISSON = (0.3, 0.499)
 
 
+def _variables(youngs_modulus: float, poissons_ratio: float) -> np.ndarray:
+    """(log E, log(1/2 - nu)): what stiffness and bulk stiffness are powers of."""
+    return np.log([youngs_modulus, 0.5 - poissons_ratio])
+
+
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
-    """Fit (log E, nu) of the training recordings by L-BFGS-B from the datasets' assumed material.
+    """Fit E and nu to the training recordings by L-BFGS-B from the datasets' assumed material.
 
     Where `history.csv` stands in `run` already, the search goes on from its last row.
 
@@ -27,63 +32,59 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
     """
     train, validate = training_recordings([shortened(dataset, settings.frames) for dataset in datasets])
     history = read_history(run)
-    evaluations = 0
+    losses: dict[bytes, float] = {}
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        nonlocal evaluations
-        evaluations += 1
         parameters = torch.tensor(x, dtype=torch.float64, requires_grad=True)
-        material = (parameters[0].exp(), parameters[1])
+        material = (parameters[0].exp(), 0.5 - parameters[1].exp())
         total = torch.zeros((), dtype=torch.float64)
         try:
             for recordings in train:
                 simulated, forces = recordings.simulate(material=material)
                 total = total + training_loss(recordings, simulated, forces) / len(train)
         except SimulationError:
-            if evaluations == 1:
+            if not losses:
                 raise
             return 1e6, np.zeros(2)  # a trial step too far: the line search comes back
         total.backward()
         assert parameters.grad is not None
+        losses[x.tobytes()] = total.item()
         return total.item(), parameters.grad.numpy().copy()
 
     def record(x: np.ndarray) -> None:
-        model = FittedModel("sysid", material=(float(np.exp(x[0])), float(x[1])))
+        e, nu = float(np.exp(x[0])), float(0.5 - np.exp(x[1]))
         row = {
             "epoch": len(history),
-            "loss": objective(x)[0],
-            "validation_mm": 1e3 * mean_error(validate, model),
-            "youngs_modulus": float(np.exp(x[0])),
-            "poissons_ratio": float(x[1]),
+            "loss": losses[x.tobytes()] if x.tobytes() in losses else objective(x)[0],
+            "validation_mm": 1e3 * mean_error(validate, FittedModel("sysid", material=(e, nu))),
+            "youngs_modulus": e,
+            "poissons_ratio": nu,
         }
         history.append(row)
         write_history(run, history)
         report(row)
 
     assumed = datasets[0].simulator.material
-    first = {"youngs_modulus": assumed.youngs_modulus, "poissons_ratio": assumed.poissons_ratio}
-    last = history[-1] if history else first
-    start = np.array([np.log(last["youngs_modulus"]), np.clip(last["poissons_ratio"], *POISSON)])
-    if not history:
+    if history:
+        start = _variables(history[-1]["youngs_modulus"], history[-1]["poissons_ratio"])
+    else:
+        start = _variables(assumed.youngs_modulus, float(np.clip(assumed.poissons_ratio, *POISSON)))
         record(start)
 
-    # Tenths of nu and of log E are of like effect; L-BFGS-B wants its variables so.
-    scale = np.array([1.0, 0.1])
+    def relative(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = objective(x)
+        return value / history[0]["loss"], slope / history[0]["loss"]
 
-    def scaled(y: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = objective(y * scale)
-        return value / history[0]["loss"], slope * scale / history[0]["loss"]
-
+    stiffest, softest = _variables(MODULUS[1], POISSON[0]), _variables(MODULUS[0], POISSON[1])
     result = minimize(
-        scaled,
-        start / scale,
+        relative,
+        start,
         jac=True,
         method="L-BFGS-B",
-        bounds=[LOG_MODULUS, (POISSON[0] / scale[1], POISSON[1] / scale[1])],
-        callback=lambda y: record(y * scale),
-        options={"maxiter": max(settings.epochs - len(history) + 1, 0), "ftol": 1e-7, "gtol": 1e-6},
+        bounds=[(softest[0], stiffest[0]), (softest[1], stiffest[1])],
+        callback=record,
+        options={"maxiter": max(settings.epochs - len(history) + 1, 0), "ftol": 1e-7, "gtol": 1e-7},
     )
-    best = result.x * scale
-    model = FittedModel("sysid", material=(float(np.exp(best[0])), float(best[1])))
+    model = FittedModel("sysid", material=(float(np.exp(result.x[0])), float(0.5 - np.exp(result.x[1]))))
     save_model(run, model)
     return model
