@@ -1,5 +1,6 @@
 """The commands `rafl-render` and `rafl-capture`."""
 
+from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -16,8 +17,7 @@ from capture.render import Look, Painter
 from capture.specimen import read_specimen
 from groundwork import InputError, command_line, progress, user_command, write_text
 from rafl.dataset import write_dataset
-from rafl.material import Material
-from rafl.simulator import SimulationError
+from rafl.newton import SimulationError
 
 render_app = command_line("Film simulated specimens.")
 capture_app = command_line("Build datasets.")
@@ -76,7 +76,7 @@ def render(
     loads, twists = _numbers(loads_g, "--loads-g"), _numbers(twists_deg, "--twists-deg")
     if not loads and not twists:
         raise InputError("expected at least one recording, found none; give --loads-g or --twists-deg")
-    truth = Material(youngs_modulus, poissons_ratio, described.material.density, described.material.mass)
+    truth = replace(described.material, youngs_modulus=youngs_modulus, poissons_ratio=poissons_ratio)
     look = Look(0.5e-3 * dot_mm, blur_px, exposure, noise, background.value)
     with progress() as bar:
         task = bar.add_task("simulating", total=len(loads) + len(twists))

@@ -8,7 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.markers import Markers
-from rafl.simulator import SimulationError, Simulator
+from rafl.newton import SimulationError
+from rafl.simulator import Simulator
 
 Array = NDArray[Any]
 
@@ -115,7 +116,5 @@ def _marker_jacobian(
     """Derivative of the seen markers (3 M') by the forces on the nodes (3 L) [m/N]."""
     by_q = torch.autograd.functional.jacobian(markers.positions, torch.from_numpy(q), vectorize=True).numpy()
     rows = by_q[seen].reshape(-1, *q.shape)  # (3 M', N, 3)
-    mu, lam = (np.full(1, value) for value in simulator.material.lame)
-    columns = np.moveaxis(rows, 0, -1)[None]
-    solved = simulator.tangent_solve(simulator.tangent(q[None], mu, lam), np.zeros((1, len(q))), columns)[0]
+    solved = simulator.solve_tangent(q[None], np.moveaxis(rows, 0, -1)[None])[0]
     return np.moveaxis(solved[nodes], -1, 0).reshape(len(rows), -1)

@@ -62,8 +62,8 @@ def _released(name: str, load: float, simulator: Simulator, q: Array, frames: in
     start = Start(
         torch.from_numpy(q),
         torch.zeros(q.shape, dtype=torch.float64),
-        torch.from_numpy(simulator.weight[None]),
-        simulator.node_mass[None],
+        torch.zeros(q.shape, dtype=torch.float64),
+        torch.zeros(q.shape[:2], dtype=torch.float64),
         (name,),
     )
     with torch.no_grad():

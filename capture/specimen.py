@@ -9,11 +9,12 @@ from pydantic import Field, model_validator
 
 from groundwork import InputError, StrictModel, read_yaml
 from rafl.markers import Markers, embed, embedding_gap
-from rafl.material import Material
+from rafl.material import PRESETS, Material
 from rafl.mesh import HexMesh
 from rafl.simulator import Simulator
 from tracking.layout import SPECIMEN_FORMAT, MarkerLayout, MarkerList
 
+DEFAULT_PRESET: Literal["paper", "physical"] = "physical"
 Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
 
 
@@ -34,7 +35,22 @@ class _Material(StrictModel):
     youngs_modulus: float = Field(gt=0)
     poissons_ratio: float = Field(gt=-1, lt=0.5)
     density: float = Field(gt=0)
-    mass: Literal["uniform", "lumped"] = "uniform"
+    preset: Literal["paper", "physical"] = DEFAULT_PRESET
+    law: Literal["projective", "corotated", "neo-hookean"] | None = None
+    mass: Literal["uniform", "lumped"] | None = None
+    integration: Literal["full", "selective"] = "full"
+    mass_damping: float = Field(default=0.0, ge=0)
+    stiffness_damping: float = Field(default=0.0, ge=0)
+    viscosity: float = Field(default=0.0, ge=0)
+
+    def material(self) -> Material:
+        values = self.model_dump(exclude={"preset"}, exclude_none=True)
+        return Material(**(PRESETS[self.preset] | values))
+
+
+class _Simulation(StrictModel):
+    integrator: Literal["implicit-euler", "generalised-alpha"] = "implicit-euler"
+    substeps: int = Field(default=1, ge=1)
 
 
 class _Clamp(StrictModel):
@@ -53,6 +69,7 @@ class _SpecimenFile(StrictModel):
     material: _Material
     clamp: _Clamp
     load: _Load = _Load(face="x-max")
+    simulation: _Simulation = _Simulation()
     markers: Annotated[MarkerList, Field(min_length=1)]
 
 
@@ -69,6 +86,7 @@ class Specimen:
         layout: of the markers on the skin.
         clamp_layout: of the markers on the clamp; may be empty.
         text: of the file.
+        integrator, substeps: how its simulator steps in time.
     """
 
     name: str
@@ -79,10 +97,19 @@ class Specimen:
     layout: MarkerLayout
     clamp_layout: MarkerLayout
     text: str
+    integrator: str
+    substeps: int
 
     def simulator(self, time_step: float, material: Material | None = None) -> Simulator:
         """A simulator of this specimen, of its assumed material unless another is given."""
-        return Simulator(self.mesh, material or self.material, self.fixed, time_step)
+        return Simulator(
+            self.mesh,
+            material or self.material,
+            self.fixed,
+            time_step,
+            integrator=self.integrator,
+            substeps=self.substeps,
+        )
 
     def markers(self, tolerance: float) -> Markers:
         """The markers tied to the mesh.
@@ -116,10 +143,12 @@ def read_specimen(path: Path) -> Specimen:
     return Specimen(
         content.name,
         mesh,
-        Material(**content.material.model_dump()),
+        content.material.material(),
         mesh.face_nodes(content.clamp.face),
         mesh.face_nodes(content.load.face),
         MarkerLayout.of(content.markers),
         MarkerLayout.of(content.clamp.markers),
         path.read_text(encoding="utf-8"),
+        content.simulation.integrator,
+        content.simulation.substeps,
     )

@@ -13,9 +13,9 @@ from groundwork import InputError, command_line, progress, user_command, write_t
 from rafl.dataset import Dataset, read_dataset
 from rafl.evaluation import Comparison, compare, error_table, held_out_errors, split_table
 from rafl.fit import fit_residual_field, training_recordings
+from rafl.newton import SimulationError
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
-from rafl.simulator import SimulationError
 from rafl.sysid import identify_material
 
 # The network is small; the other core serves the element kernels.
@@ -98,7 +98,8 @@ def _open_run(run: Path, settings: Settings, resume: bool) -> None:
 
 def _described(model: FittedModel) -> str:
     if model.material is not None:
-        return f"identified E = {model.material[0] / 1e3:.1f} kPa, nu = {model.material[1]:.4f}"
+        e, nu = model.material["youngs_modulus"], model.material["poissons_ratio"]
+        return f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
     return "trained a residual acceleration field"
 
 

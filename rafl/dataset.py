@@ -79,12 +79,11 @@ class Dataset:
     def start(self, recordings: list[str]) -> Start:
         """Initial states and loads of some recordings as one batch."""
         chosen = [self.trajectories[name] for name in recordings]
-        mass = np.stack([self.simulator.node_mass + item.added_mass for item in chosen])
         return Start(
             torch.from_numpy(np.stack([item.q for item in chosen])),
             torch.from_numpy(np.stack([item.v for item in chosen])),
-            torch.from_numpy(np.stack([self.simulator.weight + item.load for item in chosen])),
-            mass,
+            torch.from_numpy(np.stack([item.load for item in chosen])),
+            torch.from_numpy(np.stack([item.added_mass for item in chosen])),
             tuple(recordings),
         )
 
@@ -102,6 +101,8 @@ def write_dataset(path: Path, dataset: Dataset) -> None:
                 "recipe": dataset.recipe,
                 "time_step": dataset.simulator.time_step,
                 "gravity": dataset.simulator.gravity,
+                "integrator": dataset.simulator.integrator,
+                "substeps": dataset.simulator.substeps,
             }
         )
         mesh, material, markers = dataset.simulator.mesh, dataset.simulator.material, dataset.markers
@@ -154,6 +155,8 @@ def _read(file: h5py.File) -> Dataset:
         file["mesh/fixed"][()],
         float(file.attrs["time_step"]),
         (gx, gy, gz),
+        str(file.attrs.get("integrator", "implicit-euler")),
+        int(file.attrs.get("substeps", 1)),
     )
     keys = ("rest", "quad", "weights", "normal_offset")
     names = tuple(name.decode() for name in file["markers/names"][()])

@@ -50,7 +50,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
     simulated, errors = {}, {}
     with torch.no_grad():
         for method, model in {ORIGINAL: FittedModel(ORIGINAL), **models}.items():
-            markers, _ = recordings.simulate(model.residual(dataset.simulator), model.material_tensors())
+            markers, _ = recordings.simulate(model.residual(dataset.simulator), model.parameters(dataset.simulator))
             simulated[method] = markers.numpy()
             errors[method] = frame_errors(recordings, markers)
     result = []

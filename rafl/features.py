@@ -8,7 +8,7 @@ from numba import njit, prange
 from torch import Tensor
 
 from rafl.mesh import HexMesh
-from rafl.projective import signed_svd
+from rafl.svd import signed_svd
 
 FEATURES = 34
 

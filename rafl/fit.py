@@ -11,6 +11,7 @@ import torch
 from groundwork import InputError
 from rafl.dataset import Dataset, Trajectory
 from rafl.features import GaussPoints, features
+from rafl.newton import SimulationError
 from rafl.objective import Recordings, frame_errors, training_loss
 from rafl.residual import ResidualField
 from rafl.rollout import rollout
@@ -24,7 +25,6 @@ from rafl.run import (
     save_tensors,
     write_history,
 )
-from rafl.simulator import SimulationError
 
 GRADIENT_LIMIT = 10.0  # Adam's step does not depend on the size; a diverging rollout's must not enter its memory
 
@@ -68,9 +68,8 @@ def mean_error(sets: list[Recordings], model: FittedModel) -> float:
     with torch.no_grad():
         for recordings in sets:
             try:
-                simulated, _ = recordings.simulate(
-                    model.residual(recordings.dataset.simulator), model.material_tensors()
-                )
+                simulator = recordings.dataset.simulator
+                simulated, _ = recordings.simulate(model.residual(simulator), model.parameters(simulator))
             except SimulationError:
                 return math.inf
             errors += frame_errors(recordings, simulated)

@@ -21,12 +21,12 @@ CELL_SIDES = {
 
 @dataclass(frozen=True)
 class Quadrature:
-    """The 8 Gauss points of each cell.
+    """Integration points of each cell.
 
     Attributes:
-        shape: shape functions at the points, (8 points, 8 nodes); the same in every cell.
-        gradient: rest-frame shape function gradients [1/m], (E, 8 points, 8 nodes, 3).
-        volume: quadrature weight times Jacobian [m^3], (E, 8 points).
+        shape: shape functions at the points, (P points, 8 nodes); the same in every cell.
+        gradient: rest-frame shape function gradients [1/m], (E, P points, 8 nodes, 3).
+        volume: quadrature weight times Jacobian [m^3], (E, P points).
     """
 
     shape: NDArray[np.float64]
@@ -56,30 +56,63 @@ class HexMesh:
         corners = [((i + int(di)) * (ny + 1) + j + int(dj)) * (nz + 1) + k + int(dk) for di, dj, dk in CORNERS]
         return cls(vertices, np.stack(corners, axis=1).astype(np.int64))
 
+    @classmethod
+    def from_grid(cls, cells: NDArray[np.bool_], size: ArrayLike) -> "HexMesh":
+        """The cells that are True in a grid (X, Y, Z), each of `size` (3) or one edge [m].
+
+        Vertex (0, 0, 0) of the grid is the origin; vertices run z fastest, then y, then x.
+
+        Raises:
+            ValueError: no cell is True.
+        """
+        if not cells.any():
+            raise ValueError(f"expected at least one cell in the grid of {cells.shape}, found none")
+        whole = cls.box(cells.shape, np.array(cells.shape) * size)
+        hexes = whole.hexes[cells.ravel()]
+        used, places = np.unique(hexes, return_inverse=True)
+        return cls(whole.vertices[used], places.reshape(hexes.shape))
+
+    def scaled(self, factors: ArrayLike) -> "HexMesh":
+        """The same cells stretched by `factors` (3) along x, y, z."""
+        return HexMesh(self.vertices * np.asarray(factors, dtype=float), self.hexes)
+
     @cached_property
     def quadrature(self) -> Quadrature:
-        """Gauss points at (0.5 -+ 0.5/sqrt 3) in node order.
+        """The 8 Gauss points at (0.5 -+ 0.5/sqrt 3), in node order.
 
         Raises:
             ValueError: a cell is inverted or flat; its index is in the message.
         """
         points = 0.5 + (CORNERS - 0.5) / np.sqrt(3.0)
-        factors = np.where(CORNERS[None] > 0.5, points[:, None], 1.0 - points[:, None])  # (8, 8, 3)
+        factors = np.where(CORNERS[None] > 0.5, points[:, None], 1.0 - points[:, None])  # (P, 8, 3)
         slopes = np.where(CORNERS > 0.5, 1.0, -1.0)
         local = np.stack(
             [slopes[:, a] * factors[:, :, (a + 1) % 3] * factors[:, :, (a + 2) % 3] for a in range(3)],
             axis=-1,
-        )  # (8 points, 8 nodes, 3)
+        )  # (P, 8 nodes, 3)
         jacobian = np.einsum("eni,gnj->egij", self.vertices[self.hexes], local)
         determinant = np.linalg.det(jacobian)
-        if (determinant <= 0.0).any():
-            worst = int(np.argmin(determinant.min(axis=1)))
+        size = np.ptp(self.vertices[self.hexes], axis=1).max(axis=1, keepdims=True)
+        bad = determinant <= 1e-9 * size**3
+        if bad.any():
+            worst = int(np.argmin((determinant / size**3).min(axis=1)))
             raise ValueError(
                 f"cell {worst} is inverted or flat (Jacobian {determinant[worst].min():.3g} m^3); "
                 "its eight nodes must run z fastest, then y, then x"
             )
         gradient = np.einsum("gnj,egji->egni", local, np.linalg.inv(jacobian))
-        return Quadrature(factors.prod(axis=-1), np.ascontiguousarray(gradient), determinant / 8.0)
+        return Quadrature(factors.prod(axis=-1), np.ascontiguousarray(gradient), determinant / len(points))
+
+    @cached_property
+    def mean(self) -> Quadrature:
+        """One point a cell with the cell's mean gradient (B-bar), which affine motions leave exact.
+
+        Raises:
+            ValueError: a cell is inverted or flat; its index is in the message.
+        """
+        full = self.quadrature
+        gradient = np.einsum("eg,egnj->enj", full.volume, full.gradient) / self.volumes[:, None, None]
+        return Quadrature(full.shape.mean(0, keepdims=True), gradient[:, None], self.volumes[:, None])
 
     @cached_property
     def volumes(self) -> NDArray[np.float64]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rafl.dataset import Dataset
+from rafl.parameters import Parameters
 from rafl.rollout import ResidualForce, rollout
 
 LOSS_SCALE = 1e3
@@ -44,7 +45,7 @@ class Recordings:
         return cls(dataset, names, torch.from_numpy(markers), torch.from_numpy(valid))
 
     def simulate(
-        self, residual: ResidualForce | None = None, material: tuple[Tensor, Tensor] | None = None
+        self, residual: ResidualForce | None = None, parameters: Parameters | None = None
     ) -> tuple[Tensor, Tensor]:
         """Simulated markers (T, B, M, 3) [m] and residual forces (T - 1, B, N, 3) [N]."""
         positions, forces = rollout(
@@ -52,7 +53,7 @@ class Recordings:
             self.dataset.start(self.names),
             len(self.markers) - 1,
             residual,
-            material,
+            parameters,
         )
         return self.dataset.markers.positions(positions), forces
 

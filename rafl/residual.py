@@ -35,11 +35,11 @@ class ResidualField(nn.Module):
         return self.network(inputs * self.scale)
 
     def on(self, simulator: Simulator) -> ResidualForce:
-        """This field on a specimen: (q, v) -> nodal forces [N], all (B, N, 3)."""
+        """This field on a specimen: (q, v, external force) -> nodal forces [N], all (B, N, 3)."""
         points = GaussPoints.of(simulator.mesh, simulator.material.density)
         gravity = torch.tensor(simulator.gravity, dtype=torch.float64)
 
-        def force(q: Tensor, v: Tensor) -> Tensor:
+        def force(q: Tensor, v: Tensor, external: Tensor) -> Tensor:
             inputs, rotation = features(q, v, points, gravity)
             acceleration = (rotation @ self(inputs)[..., None])[..., 0]
             return points.accumulate(acceleration, q.shape[1])

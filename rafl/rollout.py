@@ -1,60 +1,18 @@
-"""Differentiable simulation: one implicit Euler step as an autograd node, and trajectories of steps."""
+"""Differentiable simulation: trajectories of implicit steps, and static equilibria."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from rafl.material import lame
-from rafl.simulator import SimulationError, Simulator
+from rafl.implicit import InternalForce, Minimum, Setting
+from rafl.integrator import INTEGRATORS, Problem, State, green_strain
+from rafl.newton import SimulationError
+from rafl.parameters import Parameters
+from rafl.simulator import Simulator
 
-ResidualForce = Callable[[Tensor, Tensor], Tensor]
-
-
-class _Step(torch.autograd.Function):
-    """Next positions; gradients by the implicit-function theorem, one tangent solve a step.
-
-    The step minimises m / (2 dt^2) |q' - y|^2 + elastic energy with y = q + dt v + dt^2 f / m, so at
-    its solution (m / dt^2 + K) dq' = m / dt^2 dy - d(elastic gradient).
-    """
-
-    @staticmethod
-    def forward(  # type: ignore[override]
-        ctx, q: Tensor, v: Tensor, force: Tensor, mu: Tensor, lam: Tensor, simulator: Simulator,
-        mass: np.ndarray, what: str,
-    ) -> Tensor:  # fmt: skip
-        arrays = (q.detach().numpy(), v.detach().numpy(), force.detach().numpy())
-        stiffness = (mu.detach().numpy(), lam.detach().numpy())
-        after = simulator.step(*arrays, *stiffness, mass, what)
-        ctx.simulator, ctx.mass = simulator, mass
-        result = torch.from_numpy(after)
-        ctx.save_for_backward(result, mu, lam)
-        return result
-
-    @staticmethod
-    def backward(ctx, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        after, mu, lam = (tensor.detach().numpy() for tensor in ctx.saved_tensors)
-        simulator, dt = ctx.simulator, ctx.simulator.time_step
-        inertia = ctx.mass / dt**2
-        tangent = simulator.tangent(after, mu, lam)
-        adjoint = simulator.tangent_solve(tangent, inertia, grad.numpy())
-        by_target = inertia[:, :, None] * adjoint
-        by_q = by_target.copy()
-        held = simulator.fixed
-        by_q[:, held] += (grad.numpy() - simulator.tangent_product(tangent, adjoint))[:, held]
-        by_mu = by_lam = None
-        if ctx.needs_input_grad[3] or ctx.needs_input_grad[4]:
-            one, zero = np.ones(len(after)), np.zeros(len(after))
-            by_mu, by_lam = (
-                torch.from_numpy(-(adjoint * simulator.elastic_gradient(after, *pair)).sum(axis=(1, 2)))
-                for pair in ((one, zero), (zero, one))
-            )
-        return (
-            torch.from_numpy(by_q), torch.from_numpy(dt * by_target), torch.from_numpy(adjoint),
-            by_mu, by_lam, None, None, None,
-        )  # fmt: skip
+ResidualForce = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
 @dataclass(frozen=True)
@@ -63,16 +21,61 @@ class Start:
 
     Attributes:
         q, v: positions [m] and velocities [m/s], (B, N, 3).
-        force: constant nodal forces, gravity included [N], (B, N, 3).
-        mass: nodal masses, hung-on loads included [kg], (B, N).
+        force: constant nodal forces, gravity excepted [N], (B, N, 3).
+        added_mass: hung-on mass that swings along [kg], (B, N); its weight belongs to `force`.
         names: of the trajectories, for messages, (B).
     """
 
     q: Tensor
     v: Tensor
     force: Tensor
-    mass: np.ndarray
+    added_mass: Tensor
     names: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Body:
+    """A batch's material in the form that steps want it."""
+
+    simulator: Simulator
+    parameters: Parameters
+    moduli: Tensor  # (B, 5)
+    mass: Tensor  # (B, N)
+    weight: Tensor  # (B, N, 3)
+
+    @classmethod
+    def of(cls, simulator: Simulator, parameters: Parameters | None, added_mass: Tensor) -> "_Body":
+        values = parameters or simulator.parameters()
+        batch = len(added_mass)
+        own = values.density.expand(batch)[:, None] * torch.from_numpy(simulator.node_volume)
+        weight = own[..., None] * values.gravity.expand(batch, 3)[:, None]
+        moduli = values.moduli(simulator.material.law, batch)
+        return cls(simulator, values, moduli, own + added_mass, weight)
+
+    def past(self, state: State, problem: Problem) -> tuple[Tensor, Tensor] | tuple[None, None]:
+        """Drift and strain history of a step, where there is damping."""
+        if not self.parameters.damped:
+            return None, None
+        strain, change = self._strains(state)
+        return problem.drift, problem.strain_rate * strain + problem.strain_memory * change
+
+    def _strains(self, state: State) -> tuple[Tensor, Tensor]:
+        mesh, points = self.simulator.mesh, self.simulator.engine.points
+        return green_strain(state.q, state.v, torch.from_numpy(mesh.hexes), torch.from_numpy(points.gradient))
+
+    def acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
+        """What the free nodes start with under `force`, gravity included [m/s^2], (B, N, 3)."""
+        alpha = self.parameters.mass_damping.expand(len(q))[:, None, None]
+        drift = strain = None
+        if self.parameters.damped:
+            state = State(q, v, torch.zeros_like(q))
+            at_rest, change = self._strains(state)
+            drift, strain = q - v, at_rest - change
+        inner = InternalForce.apply(q, self.moduli, drift, strain, Setting(self.simulator, None))
+        a = (force - inner) / self.mass[..., None] - alpha * v
+        free = torch.ones(q.shape[1], 1, dtype=torch.float64)
+        free[torch.from_numpy(self.simulator.fixed)] = 0.0
+        return a * free
 
 
 def rollout(
@@ -80,40 +83,87 @@ def rollout(
     start: Start,
     steps: int,
     residual: ResidualForce | None = None,
-    material: tuple[Tensor, Tensor] | None = None,
+    parameters: Parameters | None = None,
+    clamp: Tensor | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Simulate a batch of trajectories (paper, eq. 1 and 2), differentiably.
+
+    Gradients flow to the initial state, forces, added mass, every parameter, the clamp's motion and
+    whatever `residual` depends on.
 
     Args:
         simulator: the specimen.
         start: initial state and loads.
         steps: number of time steps T.
-        residual: (q, v) -> nodal force (B, N, 3) [N], applied explicitly at the start of each step.
-        material: Young's modulus [Pa] and Poisson's ratio, scalars or (B,) tensors; else the simulator's.
+        residual: (q, v, external force, gravity included) -> nodal force (B, N, 3) [N], applied
+            explicitly: taken at the start of each time step and held through it.
+        parameters: other than the simulator's own (`simulator.parameters(...)`), also by trajectory.
+        clamp: where the held nodes are after each step [m], (T, B, F, 3); else they stay.
 
     Returns:
         Positions (T + 1, B, N, 3) [m] and residual forces (T, B, N, 3) [N] (zero-size without one).
 
     Raises:
-        SimulationError: names recording and step.
+        SimulationError: names trajectory, step and residual.
     """
-    batch = len(start.q)
-    modulus = (simulator.material.youngs_modulus, simulator.material.poissons_ratio)
-    e, nu = (torch.as_tensor(value, dtype=torch.float64) for value in material or modulus)
-    mu, lam = lame(e.expand(batch), nu.expand(batch))
-    q, v = start.q, start.v
-    positions, forces = [q], []
+    integrator = INTEGRATORS[simulator.integrator]
+    body = _Body.of(simulator, parameters, start.added_mass)
+    external = start.force + body.weight
+    h = simulator.time_step / simulator.substeps
+    alpha = body.parameters.mass_damping.expand(len(start.q))[:, None]
+    factors = simulator.engine.allocate(len(start.q))
+    fixed = torch.from_numpy(simulator.fixed)
+    state = State(start.q, start.v, torch.zeros_like(start.q))
+    positions, forces = [start.q], []
     for step in range(steps):
-        force = start.force
+        force = external
         if residual is not None:
-            extra = residual(q, v)
-            forces.append(extra)
-            force = force + extra
-        try:
-            after = _Step.apply(q, v, force, mu, lam, simulator, start.mass, f"step {step + 1}")
-        except SimulationError as error:
-            raise SimulationError(f"{error} [recordings: {', '.join(start.names)}]") from None
-        v = (after - q) / simulator.time_step
-        q = after
-        positions.append(q)
-    return torch.stack(positions), torch.stack(forces) if forces else q.new_zeros(0)
+            forces.append(residual(state.q, state.v, external))
+            force = external + forces[-1]
+        if step == 0 and integrator.uses_acceleration:
+            state = State(state.q, state.v, body.acceleration(state.q, state.v, force))
+        begin = state.q[:, fixed]
+        for substep in range(simulator.substeps):
+            problem = integrator.problem(state, body.mass, alpha, h)
+            held = begin
+            if clamp is not None:
+                share = (substep + integrator.fraction) / simulator.substeps
+                held = (1.0 - share) * begin + share * clamp[step]
+            drift, strain = body.past(state, problem)
+            setting = Setting(simulator, problem.guess, problem.rate, problem.strain_rate, f"step {step + 1}", factors)
+            try:
+                x = Minimum.apply(problem.target, problem.inertia, force, held, body.moduli, drift, strain, setting)
+            except SimulationError as error:
+                raise SimulationError(f"{error} [trajectories: {', '.join(start.names)}]") from None
+            state = integrator.advance(state, x, h)
+        positions.append(state.q)
+    return torch.stack(positions), torch.stack(forces) if forces else start.q.new_zeros(0)
+
+
+def equilibrium(
+    simulator: Simulator,
+    force: Tensor,
+    parameters: Parameters | None = None,
+    held: Tensor | None = None,
+    what: str = "equilibrium",
+) -> Tensor:
+    """Static equilibrium [m], (B, N, 3), differentiable by forces, parameters and held positions.
+
+    Args:
+        simulator: the specimen.
+        force: nodal forces, gravity excepted [N], (B, N, 3).
+        parameters: other than the simulator's own.
+        held: positions of the held nodes [m], (B, F, 3); else as at rest.
+        what: named in errors.
+
+    Raises:
+        SimulationError: no convergence, not even with the load put on in steps.
+    """
+    batch, nodes = force.shape[:2]
+    body = _Body.of(simulator, parameters, force.new_zeros(batch, nodes))
+    if held is None:
+        held = torch.from_numpy(simulator.mesh.vertices[simulator.fixed]).expand(batch, -1, 3)
+    setting = Setting(simulator, None, what=what)
+    none = force.new_zeros(batch, nodes)
+    rest = torch.zeros_like(force)
+    return Minimum.apply(rest, none, force + body.weight, held, body.moduli, None, None, setting)

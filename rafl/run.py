@@ -8,6 +8,7 @@ import torch
 import yaml
 
 from groundwork import InputError, check_format, require_file, whole_file, write_text
+from rafl.parameters import Parameters
 from rafl.residual import ResidualField
 from rafl.rollout import ResidualForce
 from rafl.simulator import Simulator
@@ -22,23 +23,20 @@ class FittedModel:
     Attributes:
         method: `rafl` or `sysid`.
         field: the residual acceleration field, for `rafl`.
-        material: Young's modulus [Pa] and Poisson's ratio, for `sysid`.
+        material: identified values by their name in `rafl.parameters.Parameters`, for `sysid`.
     """
 
     method: str
     field: ResidualField | None = None
-    material: tuple[float, float] | None = None
+    material: dict[str, float] | None = None
 
     def residual(self, simulator: Simulator) -> ResidualForce | None:
         """The residual force on a specimen, if this model has one."""
         return self.field.on(simulator) if self.field is not None else None
 
-    def material_tensors(self) -> tuple[torch.Tensor, torch.Tensor] | None:
-        """The material to simulate with, if this model has one."""
-        if self.material is None:
-            return None
-        e, nu = (torch.tensor(value, dtype=torch.float64) for value in self.material)
-        return e, nu
+    def parameters(self, simulator: Simulator) -> Parameters:
+        """What to simulate a specimen with: its own material, or the identified one."""
+        return simulator.parameters(**(self.material or {}))
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ def save_model(run: Path, model: FittedModel) -> None:
     if model.field is not None:
         content["field"] = model.field.state_dict()
     if model.material is not None:
-        content["material"] = list(model.material)
+        content["material"] = dict(model.material)
     save_tensors(run / "model.pt", content)
 
 
@@ -129,8 +127,7 @@ def load_model(run: Path) -> FittedModel:
     """
     content = load_tensors(run / "model.pt", "a fitted model (written by rafl-fit)")
     if content["method"] == "sysid":
-        e, nu = content["material"]
-        return FittedModel("sysid", material=(e, nu))
+        return FittedModel("sysid", material=dict(content["material"]))
     field = ResidualField()
     field.load_state_dict(content["field"])
     return FittedModel("rafl", field=field)

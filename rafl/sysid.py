@@ -8,9 +8,9 @@ from scipy.optimize import minimize
 
 from rafl.dataset import Dataset
 from rafl.fit import Report, mean_error, shortened, training_recordings
+from rafl.newton import SimulationError
 from rafl.objective import training_loss
 from rafl.run import FittedModel, Settings, read_history, save_model, write_history
-from rafl.simulator import SimulationError
 
 MODULUS = (2e4, 1e7)  # Pa
 POISSON = (0.3, 0.499)
@@ -19,6 +19,10 @@ POISSON = (0.3, 0.499)
 def _variables(youngs_modulus: float, poissons_ratio: float) -> np.ndarray:
     """(log E, log(1/2 - nu)): what stiffness and bulk stiffness are powers of."""
     return np.log([youngs_modulus, 0.5 - poissons_ratio])
+
+
+def _identified(x: np.ndarray) -> dict[str, float]:
+    return {"youngs_modulus": float(np.exp(x[0])), "poissons_ratio": float(0.5 - np.exp(x[1]))}
 
 
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
@@ -36,11 +40,11 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
         parameters = torch.tensor(x, dtype=torch.float64, requires_grad=True)
-        material = (parameters[0].exp(), 0.5 - parameters[1].exp())
+        values = {"youngs_modulus": parameters[0].exp(), "poissons_ratio": 0.5 - parameters[1].exp()}
         total = torch.zeros((), dtype=torch.float64)
         try:
             for recordings in train:
-                simulated, forces = recordings.simulate(material=material)
+                simulated, forces = recordings.simulate(parameters=recordings.dataset.simulator.parameters(**values))
                 total = total + training_loss(recordings, simulated, forces) / len(train)
         except SimulationError:
             if not losses:
@@ -52,13 +56,11 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         return total.item(), parameters.grad.numpy().copy()
 
     def record(x: np.ndarray) -> None:
-        e, nu = float(np.exp(x[0])), float(0.5 - np.exp(x[1]))
         row = {
             "epoch": len(history),
             "loss": losses[x.tobytes()] if x.tobytes() in losses else objective(x)[0],
-            "validation_mm": 1e3 * mean_error(validate, FittedModel("sysid", material=(e, nu))),
-            "youngs_modulus": e,
-            "poissons_ratio": nu,
+            "validation_mm": 1e3 * mean_error(validate, FittedModel("sysid", material=_identified(x))),
+            **_identified(x),
         }
         history.append(row)
         write_history(run, history)
@@ -85,6 +87,6 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         callback=record,
         options={"maxiter": max(settings.epochs - len(history) + 1, 0), "ftol": 1e-7, "gtol": 1e-7},
     )
-    model = FittedModel("sysid", material=(float(np.exp(result.x[0])), float(0.5 - np.exp(result.x[1]))))
+    model = FittedModel("sysid", material=_identified(result.x))
     save_model(run, model)
     return model

@@ -10,6 +10,19 @@ from support import Run
 
 from capture.specimen import Specimen, read_specimen
 
+
+def _forget_stale_kernels() -> None:
+    """numba renews a compiled function when its own file changes, not when one that it calls does."""
+    for package in ("rafl", "tracking", "capture"):
+        folder = Path(__file__).parents[1] / package
+        newest = max(path.stat().st_mtime for path in folder.rglob("*.py"))
+        for compiled in folder.rglob("*.nb[ic]"):
+            if compiled.stat().st_mtime < newest:
+                compiled.unlink()
+
+
+_forget_stale_kernels()
+
 SMALL = """format: rafl-specimen/1
 name: small
 geometry: {box_mm: [60, 20, 20], element_mm: 10}

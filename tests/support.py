@@ -44,3 +44,10 @@ def picture(
     level = low + (high - low) * cv2.GaussianBlur(cover, (0, 0), blur)
     level *= 1.0 + 0.001 * np.arange(size[0])  # light from the right
     return np.clip(np.rint(level + np.random.default_rng(seed).normal(0, noise, level.shape)), 0, 255).astype(np.uint8)
+
+
+def zero_crossing_frequency(z: np.ndarray, time_step: float) -> float:
+    """Of an oscillation about zero [Hz], from its first to its last upward crossing."""
+    before = np.flatnonzero((z[:-1] < 0) & (z[1:] >= 0))
+    times = time_step * (before + z[before] / (z[before] - z[before + 1]))
+    return (len(times) - 1) / (times[-1] - times[0])

@@ -10,7 +10,7 @@ from rafl.dataset import Dataset, Trajectory
 from rafl.material import Material
 from rafl.rollout import rollout
 
-TRUE = Material(190e3, 0.45, 1070.0, "lumped")
+TRUE = Material(190e3, 0.45, mass="lumped", law="corotated")
 LOADS = {"a": 0.04, "b": 0.10, "c": 0.07, "d": 0.08}
 SPLITS = {"a": "train", "b": "train", "c": "val", "d": "test"}
 FRAMES = 25

@@ -81,8 +81,8 @@ def test_force_turns_with_the_body(field: tuple[ResidualField, Simulator], rando
     v = torch.tensor(random.normal(0, 0.2, q.shape))
     gx, gy, gz = (turn @ torch.tensor(simulator.gravity, dtype=torch.float64)).tolist()
     turned = Simulator(simulator.mesh, simulator.material, simulator.fixed, gravity=(gx, gy, gz))
-    force = model.on(simulator)(q, v)
-    torch.testing.assert_close(model.on(turned)(q @ turn.T, v @ turn.T), force @ turn.T, atol=1e-12, rtol=1e-9)
+    force = model.on(simulator)(q, v, 0 * q)
+    torch.testing.assert_close(model.on(turned)(q @ turn.T, v @ turn.T, 0 * q), force @ turn.T, atol=1e-12, rtol=1e-9)
 
 
 def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
@@ -93,10 +93,10 @@ def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], ran
     c, dq, dv = (torch.tensor(random.normal(size=q.shape)) for _ in range(3))
     q.requires_grad_()
     v.requires_grad_()
-    (force(q, v) * c).sum().backward()
+    (force(q, v, 0 * q) * c).sum().backward()
     h = 1e-6
     with torch.no_grad():
-        slope = ((force(q + h * dq, v + h * dv) - force(q - h * dq, v - h * dv)) * c).sum() / (2 * h)
+        slope = ((force(q + h * dq, v + h * dv, q) - force(q - h * dq, v - h * dv, q)) * c).sum() / (2 * h)
     assert q.grad is not None
     assert v.grad is not None
     assert float((q.grad * dq + v.grad * dv).sum()) == pytest.approx(float(slope), rel=1e-5)
@@ -108,7 +108,7 @@ def test_weights_by_finite_differences(field: tuple[ResidualField, Simulator], r
     v = torch.tensor(random.normal(0, 0.2, q.shape))
     c = torch.tensor(random.normal(size=q.shape))
     model.zero_grad()
-    (model.on(simulator)(q, v) * c).sum().backward()
+    (model.on(simulator)(q, v, 0 * q) * c).sum().backward()
     for weight in model.parameters():
         direction = torch.tensor(random.normal(size=weight.shape))
         assert weight.grad is not None
@@ -117,7 +117,7 @@ def test_weights_by_finite_differences(field: tuple[ResidualField, Simulator], r
             values = []
             for sign in (1, -1):
                 weight += sign * 1e-6 * direction
-                values.append(float((model.on(simulator)(q, v) * c).sum()))
+                values.append(float((model.on(simulator)(q, v, 0 * q) * c).sum()))
                 weight -= sign * 1e-6 * direction
         assert gradient == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-5)
 

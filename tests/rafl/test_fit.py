@@ -65,8 +65,8 @@ def test_system_identification_explains_the_recordings(dataset: Dataset, tmp_pat
     held_out = [Recordings.of(dataset, ["d"])]
     assert mean_error(held_out, model) < 0.01 * mean_error(held_out, FittedModel("original"))
     assert model.material is not None
-    assert model.material[0] == pytest.approx(190e3, rel=0.15)
-    assert model.material[1] == pytest.approx(0.45, abs=0.05)
+    assert model.material["youngs_modulus"] == pytest.approx(190e3, rel=0.15)
+    assert model.material["poissons_ratio"] == pytest.approx(0.45, abs=0.05)
     assert load_model(tmp_path).material == model.material
 
 

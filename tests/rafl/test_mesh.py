@@ -64,8 +64,40 @@ def test_face_nodes() -> None:
 def test_masses() -> None:
     """Lumped mass is the true one; the paper's gives every node a whole cell's."""
     mesh = HexMesh.box((10, 3, 3), (0.1, 0.03, 0.03))
-    assert Material(mass="lumped").node_mass(mesh).sum() == pytest.approx(1070 * 9e-5)
-    assert Material(mass="uniform").node_mass(mesh).sum() == pytest.approx(0.18832)
+    assert Material(mass="lumped").node_volume(mesh).sum() == pytest.approx(9e-5)
+    assert 1070 * Material(mass="uniform").node_volume(mesh).sum() == pytest.approx(0.18832)
+
+
+def test_cells_from_a_grid_and_stretched() -> None:
+    """An L of three cells: 16 vertices, z fastest; stretching multiplies the volume."""
+    cells = np.zeros((2, 2, 1), dtype=bool)
+    cells[0], cells[1, 0] = True, True
+    mesh = HexMesh.from_grid(cells, 0.01).scaled([2.0, 1.0, 1.5])
+    assert mesh.vertices.shape == (16, 3)
+    assert mesh.volumes.sum() == pytest.approx(9e-6)
+    assert len(mesh.surface) == 14
+    np.testing.assert_array_equal(np.lexsort(mesh.vertices.T[::-1]), np.arange(16))
+    with pytest.raises(ValueError, match="at least one cell"):
+        HexMesh.from_grid(np.zeros((2, 2, 2), dtype=bool), 0.01)
+
+
+def test_a_whole_grid_is_the_box() -> None:
+    grid, box = HexMesh.from_grid(np.ones((3, 2, 2), dtype=bool), 0.01), HexMesh.box((3, 2, 2), (0.03, 0.02, 0.02))
+    np.testing.assert_allclose(grid.vertices, box.vertices)
+    np.testing.assert_array_equal(grid.hexes, box.hexes)
+
+
+@pytest.mark.parametrize("damage", ["inverted", "flat"])
+def test_bad_cells_are_refused_by_index(damage: str) -> None:
+    mesh = HexMesh.box((3, 1, 1), (0.03, 0.01, 0.01))
+    vertices, hexes = mesh.vertices.copy(), mesh.hexes.copy()
+    if damage == "inverted":
+        hexes[1] = hexes[1][[4, 5, 6, 7, 0, 1, 2, 3]]
+    else:
+        vertices[hexes[1, 4:], 0] = vertices[hexes[1, :4], 0]
+        hexes = hexes[:2]
+    with pytest.raises(ValueError, match="cell 1 is inverted or flat"):
+        _ = HexMesh(vertices, hexes).quadrature
 
 
 def test_lame() -> None:

@@ -43,7 +43,9 @@ def test_loss_of_a_known_offset(dataset: Dataset) -> None:
 
 def test_tables(dataset: Dataset) -> None:
     """+- over all (recording, frame); held-out errors are the test recordings' alone."""
-    comparisons = compare(dataset, {"sysid": FittedModel("sysid", material=(190e3, 0.45))})
+    comparisons = compare(
+        dataset, {"sysid": FittedModel("sysid", material={"youngs_modulus": 190e3, "poissons_ratio": 0.45})}
+    )
     rows = error_table(comparisons)
     assert set(rows["method"]) == {"original", "sysid"}
     assert len(rows) == 8

@@ -1,0 +1,125 @@
+"""The simulator's arithmetic in compiled kernels, on the processor's cores."""
+
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rafl.elements import element_terms, multiply
+from rafl.laws import LAWS
+from rafl.linear import Factors, LinearSolver, linear_solver, solve_indefinite
+from rafl.mesh import HexMesh, Quadrature
+from rafl.resistance import Resistance
+
+Array = NDArray[Any]
+
+
+class Compiled:
+    """Energy, gradient, tangent and linear solves of one mesh under one law.
+
+    Args:
+        mesh: the rest shape.
+        law: name of the elastic law.
+        integration: `full`, or `selective`: lambda's part at each cell's centre only.
+        fixed: held nodes, (F).
+    """
+
+    def __init__(self, mesh: HexMesh, law: str, integration: str, fixed: NDArray[np.int64]) -> None:
+        self.mesh = mesh
+        self.fixed = fixed
+        self.law = list(LAWS).index(law)
+        rule = mesh.quadrature
+        gradient, volume = [rule.gradient], [rule.volume]
+        self.shares = np.ones((1, 2))
+        if integration == "selective":
+            mean = mesh.mean
+            gradient.append(np.repeat(mean.gradient, 8, axis=1))
+            volume.append(np.pad(mean.volume, ((0, 0), (0, 7))))
+            self.shares = np.array([[1.0, 0.0], [0.0, 1.0]])
+        groups, cells = len(volume), len(mesh.hexes)
+        points = np.stack(gradient, axis=1)  # (E, G, 8 points, 8 nodes, 3)
+        self._by_point = np.ascontiguousarray(points.transpose(0, 1, 3, 4, 2)).reshape(cells, groups, 192)
+        self._by_node = np.ascontiguousarray(points.transpose(0, 1, 2, 4, 3)).reshape(cells, groups, 192)
+        self._volume = np.ascontiguousarray(np.stack(volume, axis=1))
+
+    @cached_property
+    def points(self) -> Quadrature:
+        """Every integration point, those of no weight included, as `strain` counts them."""
+        cells = len(self.mesh.hexes)
+        gradient = self._by_node.reshape(cells, -1, 3, 8).transpose(0, 1, 3, 2)
+        return Quadrature(self.mesh.quadrature.shape, gradient, self._volume.reshape(cells, -1))
+
+    @cached_property
+    def point_shares(self) -> Array:
+        """How much of mu and of lambda each integration point carries, (P, 2)."""
+        return np.repeat(self.shares, 8, axis=0)
+
+    @cached_property
+    def linear(self) -> LinearSolver:
+        """The direct solver of its tangent systems."""
+        return linear_solver(self.mesh, self.fixed)
+
+    @property
+    def free_index(self) -> NDArray[np.int64]:
+        """Flat indices into (N * 3) of the unknowns, in the solver's order, (n)."""
+        return self.linear.free_index
+
+    def terms(
+        self, q: Array, resistance: Resistance, *, tangent: bool, project: bool = False
+    ) -> tuple[Array, Array, Array]:
+        """Energy [J] (B), nodal gradient [N] (B, N, 3) and, if wanted, the cells' tangents [N/m].
+
+        Tangents are an opaque array for `factor`, `multiply` and `solve_once`; with `project` they are
+        positive semi-definite, else exact.
+        """
+        batch = len(q)
+        energy, gradient = np.empty(batch), np.empty_like(q)
+        stiffness = np.empty((batch if tangent else 0, len(self.mesh.hexes), 6, 8, 8))
+        none = np.zeros((1, 1, 1, 1))
+        element_terms(
+            q, self.mesh.hexes, self._by_point, self._by_node, self._volume, self.shares, self.law,
+            resistance.moduli, resistance.damped,
+            none[0] if resistance.drift is None else resistance.drift,
+            none if resistance.strain is None else resistance.strain,
+            resistance.rate, resistance.strain_rate, project, tangent, energy, gradient, stiffness,
+        )  # fmt: skip
+        return energy, gradient, stiffness
+
+    def multiply(self, tangents: Array, x: Array) -> Array:
+        """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
+        out = np.empty_like(x)
+        multiply(tangents, self.mesh.hexes, x, out)
+        return out
+
+    def allocate(self, batch: int) -> Factors:
+        """Room for the factors of a batch."""
+        return self.linear.allocate(batch)
+
+    def factor(self, factors: Factors, rows: Array, tangents: Array, diagonal: Array) -> NDArray[np.bool_]:
+        """Factor tangents plus a diagonal (R, n) into `rows`; True where positive definite."""
+        return self.linear.factor(factors, rows, tangents, diagonal)
+
+    def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
+        """Solutions (R, C, n) of right sides (R, C, n)."""
+        return self.linear.solve(factors, rows, right)
+
+    def solve_once(self, tangents: Array, diagonal: Array, right: Array) -> Array:
+        """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""
+        rows = np.arange(len(right))
+        factors = self.allocate(len(right))
+        definite = self.factor(factors, rows, tangents, diagonal)
+        solution = np.empty_like(right)
+        if definite.any():
+            solution[definite] = self.solve(factors, rows[definite], right[definite])
+        for t in np.flatnonzero(~definite):
+            solution[t] = solve_indefinite(self.linear.unknowns, tangents[t], diagonal[t], right[t])
+        return solution
+
+    @cached_property
+    def _stiffness_per_modulus(self) -> float:
+        return float(np.einsum("egni,eg->en", self.points.gradient**2, self.points.volume).max())
+
+    def stiffest(self, moduli: Array) -> Array:
+        """A bound on the tangents' diagonal at rest [N/m], (B)."""
+        return (2.0 * moduli[:, 0] + moduli[:, 1]) * self._stiffness_per_modulus

@@ -1,0 +1,56 @@
+"""What the simulator asks of its arithmetic; `rafl.compiled` and `rafl.plain` both answer."""
+
+from typing import Any, Protocol
+
+from numpy.typing import NDArray
+
+from rafl.linear import Factors
+from rafl.mesh import HexMesh, Quadrature
+from rafl.resistance import Resistance
+
+Array = NDArray[Any]
+
+
+class Engine(Protocol):
+    """Energy, gradient, tangent and linear solves of one mesh under one law, for batches."""
+
+    mesh: HexMesh
+
+    @property
+    def free_index(self) -> Array:
+        """Flat indices into (N * 3) of the unknowns, in the solver's order, (n)."""
+
+    @property
+    def points(self) -> Quadrature:
+        """Every integration point, those of no weight included."""
+
+    @property
+    def point_shares(self) -> Array:
+        """How much of mu and of lambda each integration point carries, (P, 2)."""
+
+    def terms(
+        self, q: Array, resistance: Resistance, *, tangent: bool, project: bool = False
+    ) -> tuple[Array, Array, Any]:
+        """Energy [J] (B), nodal gradient [N] (B, N, 3) and, if wanted, tangents [N/m].
+
+        Tangents are for `factor`, `multiply` and `solve_once` only; with `project` they are positive
+        semi-definite, else exact.
+        """
+
+    def multiply(self, tangents: Any, x: Array) -> Array:
+        """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
+
+    def allocate(self, batch: int) -> Factors:
+        """Room for the factors of a batch."""
+
+    def factor(self, factors: Factors, rows: Array, tangents: Any, diagonal: Array) -> NDArray:
+        """Factor tangents plus a diagonal (R, n) into `rows`; True where positive definite."""
+
+    def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
+        """Solutions (R, C, n) of right sides (R, C, n)."""
+
+    def solve_once(self, tangents: Any, diagonal: Array, right: Array) -> Array:
+        """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""
+
+    def stiffest(self, moduli: Array) -> Array:
+        """A bound on the tangents' diagonal at rest [N/m], (B)."""

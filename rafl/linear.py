@@ -1,0 +1,364 @@
+"""Direct solvers of the tangent systems: narrow bands, and blocks of levels for larger meshes.
+
+Both keep the same promises: `allocate` room for a batch of factors, `factor` some of its rows,
+`solve` with them. A matrix comes as the cells' stiffnesses and a diagonal over the free unknowns.
+"""
+
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import Any, Protocol
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import blas, lapack
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import reverse_cuthill_mckee
+from scipy.sparse.linalg import splu
+from threadpoolctl import ThreadpoolController
+
+from rafl.band import factor_bands, scatter, solve_bands
+from rafl.mesh import HexMesh
+
+Array = NDArray[Any]
+
+WIDEST_BAND = 260  # beyond it blocks of levels win
+
+_BLAS = ThreadpoolController()
+
+
+@dataclass
+class Factors:
+    """Factors of a batch of matrices, kept from one Newton step to the next.
+
+    Attributes:
+        storage: whatever the solver fills, by trajectory.
+        ready: which of them can be used, (B).
+    """
+
+    storage: Any
+    ready: NDArray[np.bool_]
+
+
+class LinearSolver(Protocol):
+    """Factors and solves tangent systems over the free unknowns of one mesh."""
+
+    free_index: NDArray[np.int64]
+    unknowns: "Unknowns"
+
+    def allocate(self, batch: int) -> Factors:
+        """Room for the factors of a batch."""
+
+    def factor(self, factors: Factors, rows: Array, stiffness: Array, diagonal: Array) -> NDArray[np.bool_]:
+        """Factor `rows` of the batch; True where the matrix was positive definite."""
+
+    def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
+        """Solutions (R, C, n) of right sides (R, C, n)."""
+
+
+class Unknowns:
+    """Numbering of the free nodes' unknowns, and where the cells' entries belong.
+
+    Attributes:
+        order: free nodes in the order of their unknowns.
+        free_index: flat indices into (N * 3) of the unknowns, in order, (n).
+        rows, columns: of the entries of every cell, row >= column; -1 where one is held or counted
+            already, (E, 384).
+    """
+
+    def __init__(self, mesh: HexMesh, order: NDArray[np.int64]) -> None:
+        self.order = order
+        self.free_index = (3 * order[:, None] + np.arange(3)).ravel()
+        first = np.full(len(mesh.vertices), -1, dtype=np.int64)
+        first[order] = 3 * np.arange(len(order))
+        at = first[mesh.hexes]  # (E, 8)
+        rows, columns = [], []
+        for i in range(3):
+            for k in range(i + 1):
+                row, column = np.broadcast_arrays(at[:, :, None] + i, at[:, None, :] + k)
+                counts = (at[:, :, None] >= 0) & (at[:, None, :] >= 0)
+                if i == k:
+                    counts = counts & np.tri(8, dtype=bool)
+                rows.append(np.where(counts, np.maximum(row, column), -1).reshape(len(at), 64))
+                columns.append(np.where(counts, np.minimum(row, column), -1).reshape(len(at), 64))
+        self.rows = np.concatenate(rows, axis=1)
+        self.columns = np.concatenate(columns, axis=1)
+
+    @property
+    def count(self) -> int:
+        """Number of unknowns n."""
+        return len(self.free_index)
+
+    @cached_property
+    def width(self) -> int:
+        """Bandwidth, the diagonal included."""
+        return int((self.rows - self.columns).max()) + 1
+
+    def sparse(self, stiffness: Array, diagonal: Array) -> csr_array:
+        """One trajectory's matrix, both triangles."""
+        rows, columns, values = self.rows.ravel(), self.columns.ravel(), stiffness.reshape(-1)
+        kept = rows >= 0
+        lower = coo_array((values[kept], (rows[kept], columns[kept])), shape=(self.count, self.count)).tocsr()
+        lower.setdiag(0.5 * (lower.diagonal() + diagonal))
+        return (lower + lower.T).tocsr()
+
+
+def _graph(mesh: HexMesh, free: NDArray[np.int64]) -> csr_array:
+    rows = np.repeat(mesh.hexes, 8, axis=1).ravel()
+    columns = np.tile(mesh.hexes, (1, 8)).ravel()
+    shape = (len(mesh.vertices),) * 2
+    return coo_array((np.ones(len(rows)), (rows, columns)), shape=shape).tocsr()[free][:, free].tocsr()
+
+
+def _free(mesh: HexMesh, fixed: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.setdiff1d(np.arange(len(mesh.vertices)), fixed)
+
+
+class Banded:
+    """L D L^T of a band, for meshes with a small cross-section.
+
+    Slices across the longest side and reverse Cuthill-McKee are both tried; the narrower band wins.
+    """
+
+    def __init__(self, mesh: HexMesh, fixed: NDArray[np.int64]) -> None:
+        free = _free(mesh, fixed)
+        permuted = free[reverse_cuthill_mckee(_graph(mesh, free), symmetric_mode=True)]
+        places = np.round(mesh.vertices[free] / (1e-6 * np.ptp(mesh.vertices)))
+        longest_last = np.argsort(np.ptp(mesh.vertices, axis=0), kind="stable")
+        sliced = free[np.lexsort(places[:, longest_last].T)]
+        self.unknowns = min((Unknowns(mesh, order) for order in (sliced, permuted)), key=lambda u: u.width)
+        self.free_index = self.unknowns.free_index
+        self._cells = len(mesh.hexes)
+
+    @cached_property
+    def _destination(self) -> NDArray[np.int32]:
+        rows, columns = self.unknowns.rows, self.unknowns.columns
+        return np.where(rows >= 0, columns * self.unknowns.width + rows - columns, -1).astype(np.int32)
+
+    def allocate(self, batch: int) -> Factors:
+        """Room for the factors of a batch."""
+        size = self.unknowns.count * self.unknowns.width + 8
+        return Factors(np.zeros((batch, size)), np.zeros(batch, dtype=bool))
+
+    def factor(self, factors: Factors, rows: Array, stiffness: Array, diagonal: Array) -> NDArray[np.bool_]:
+        """Factor `rows` of the batch; True where the matrix was positive definite."""
+        pivots = np.empty(len(rows))
+        factor_bands(
+            stiffness.reshape(len(rows), self._cells, 384), diagonal, self._destination, rows, factors.storage,
+            self.unknowns.width, pivots,
+        )  # fmt: skip
+        factors.ready[rows] = pivots > 0.0
+        return pivots > 0.0
+
+    def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
+        """Solutions (R, C, n) of right sides (R, C, n)."""
+        x = np.ascontiguousarray(right).copy()
+        solve_bands(factors.storage, self.unknowns.width, rows, x)
+        return x
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Where one level's blocks stand in the flat storage."""
+
+    unknowns: slice
+    own: slice  # diagonal block, (size, size), column after column
+    up: slice  # coupling to the next level, (size of next, size)
+
+
+class Levels:
+    """Cholesky factors of a block-tridiagonal matrix, eliminated from both ends at once.
+
+    The blocks are the level sets of the mesh's graph as seen from the held nodes, so a body with a
+    thin waist costs what its sections cost and not what its thickest does.
+    """
+
+    def __init__(self, mesh: HexMesh, fixed: NDArray[np.int64]) -> None:
+        free = _free(mesh, fixed)
+        sizes, order = min(
+            (_level_sets(mesh, free, seeds) for seeds in _seeds(mesh, free, fixed)), key=lambda found: _work(found[0])
+        )
+        self.unknowns = Unknowns(mesh, order)
+        self.free_index = self.unknowns.free_index
+        self._cells = len(mesh.hexes)
+        ends = np.cumsum(sizes)
+        levels, place = [], 0
+        for k, size in enumerate(sizes):
+            after = sizes[k + 1] if k + 1 < len(sizes) else 0
+            own = slice(place, place + size * size)
+            up = slice(own.stop, own.stop + size * after)
+            levels.append(_Level(slice(ends[k] - size, ends[k]), own, up))
+            place = up.stop
+        self._levels = levels
+        self._size = place
+        work = np.cumsum([float(s) ** 3 for s in sizes])
+        self._middle = int(np.searchsorted(work, 0.5 * work[-1]))
+
+    @cached_property
+    def _destination(self) -> NDArray[np.int64]:
+        rows, columns = self.unknowns.rows, self.unknowns.columns
+        level_of = np.repeat(np.arange(len(self._levels)), [_length(level) for level in self._levels])
+        start = np.array([level.unknowns.start for level in self._levels])
+        length = np.array([_length(level) for level in self._levels])
+        own = np.array([level.own.start for level in self._levels])
+        up = np.array([level.up.start for level in self._levels])
+        low, high = level_of[columns], level_of[rows]
+        inside = own[low] + (columns - start[low]) * length[low] + rows - start[low]
+        across = up[low] + (columns - start[low]) * length[high] + rows - start[high]
+        return np.where(rows < 0, -1, np.where(low == high, inside, across))
+
+    def allocate(self, batch: int) -> Factors:
+        """Room for the factors of a batch."""
+        return Factors(np.zeros((batch, self._size)), np.zeros(batch, dtype=bool))
+
+    def _blocks(self, flat: Array) -> tuple[list[Array], list[Array]]:
+        sizes = [_length(level) for level in self._levels]
+        own = [flat[level.own].reshape(s, s, order="F") for level, s in zip(self._levels, sizes, strict=True)]
+        up = [
+            flat[level.up].reshape(after, s, order="F")
+            for level, s, after in zip(self._levels, sizes, [*sizes[1:], 0], strict=True)
+        ]
+        return own, up
+
+    def factor(self, factors: Factors, rows: Array, stiffness: Array, diagonal: Array) -> NDArray[np.bool_]:
+        """Factor `rows` of the batch; True where the matrix was positive definite."""
+        scatter(stiffness.reshape(len(rows), self._cells, 384), self._destination, rows, factors.storage)
+        last, middle = len(self._levels) - 1, self._middle
+
+        def prepare(row: int) -> tuple[list[Array], list[Array]]:
+            own, up = self._blocks(factors.storage[rows[row]])
+            for block, level in zip(own, self._levels, strict=True):
+                block[np.diag_indices(len(block))] += diagonal[row, level.unknowns]
+            return own, up
+
+        blocks = [prepare(row) for row in range(len(rows))]
+
+        def downward(row: int) -> bool:
+            own, up = blocks[row]
+            for k in range(middle):
+                if lapack.dpotrf(own[k], lower=1, clean=0, overwrite_a=1)[1] != 0:
+                    return False
+                blas.dtrsm(1.0, own[k], up[k], side=1, lower=1, trans_a=1, overwrite_b=1)
+                if k + 1 < middle:
+                    blas.dsyrk(-1.0, up[k], beta=1.0, c=own[k + 1], lower=1, overwrite_c=1)
+            return True
+
+        def upward(row: int) -> bool:
+            own, up = blocks[row]
+            for k in range(last, middle, -1):
+                if lapack.dpotrf(own[k], lower=1, clean=0, overwrite_a=1)[1] != 0:
+                    return False
+                blas.dtrsm(1.0, own[k], up[k - 1], lower=1, overwrite_b=1)
+                if k - 1 > middle:
+                    blas.dsyrk(-1.0, up[k - 1], beta=1.0, c=own[k - 1], lower=1, trans=1, overwrite_c=1)
+            return True
+
+        def meet(row: int) -> bool:
+            if not (sides[2 * row] and sides[2 * row + 1]):
+                return False
+            own, up = blocks[row]
+            if middle > 0:
+                blas.dsyrk(-1.0, up[middle - 1], beta=1.0, c=own[middle], lower=1, overwrite_c=1)
+            if middle < last:
+                blas.dsyrk(-1.0, up[middle], beta=1.0, c=own[middle], lower=1, trans=1, overwrite_c=1)
+            return lapack.dpotrf(own[middle], lower=1, clean=0, overwrite_a=1)[1] == 0
+
+        every = range(len(rows))
+        sides = _together([partial(side, r) for r in every for side in (downward, upward)])
+        met = _together([partial(meet, r) for r in every])
+        factors.ready[rows] = met
+        return np.array(met)
+
+    def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
+        """Solutions (R, C, n) of right sides (R, C, n)."""
+        last, middle = len(self._levels) - 1, self._middle
+
+        def one(row: int) -> Array:
+            own, up = self._blocks(factors.storage[rows[row]])
+            x = [np.asfortranarray(right[row, :, level.unknowns].T) for level in self._levels]
+
+            def triangle(k: int, transposed: int) -> None:
+                x[k] = blas.dtrsm(1.0, own[k], x[k], lower=1, trans_a=transposed)
+
+            for k in range(middle):
+                triangle(k, 0)
+                x[k + 1] = x[k + 1] - up[k] @ x[k]
+            for k in range(last, middle, -1):
+                triangle(k, 0)
+                x[k - 1] = x[k - 1] - up[k - 1].T @ x[k]
+            triangle(middle, 0)
+            triangle(middle, 1)
+            for k in range(middle - 1, -1, -1):
+                x[k] = x[k] - up[k].T @ x[k + 1]
+                triangle(k, 1)
+            for k in range(middle + 1, last + 1):
+                x[k] = x[k] - up[k - 1] @ x[k - 1]
+                triangle(k, 1)
+            return np.concatenate(x).T
+
+        return np.stack(_together([partial(one, r) for r in range(len(rows))]))
+
+
+def _length(level: _Level) -> int:
+    return level.unknowns.stop - level.unknowns.start
+
+
+def _work(sizes: list[int]) -> float:
+    pairs = zip(sizes, [*sizes[1:], 0], strict=True)
+    return sum(s**3 / 3 + s * s * after + s * after * after for s, after in pairs)
+
+
+def _seeds(mesh: HexMesh, free: NDArray[np.int64], fixed: NDArray[np.int64]) -> Iterable[NDArray[np.int64]]:
+    """Sets of free nodes (as places in `free`) from which levels may be counted."""
+    graph = _graph(mesh, free)
+    yield np.array([reverse_cuthill_mckee(graph, symmetric_mode=True)[0]])
+    touching = np.isin(mesh.hexes, fixed).any(axis=1)
+    beside = np.flatnonzero(np.isin(free, mesh.hexes[touching]))
+    if len(beside):
+        yield beside
+
+
+def _level_sets(
+    mesh: HexMesh, free: NDArray[np.int64], seeds: NDArray[np.int64]
+) -> tuple[list[int], NDArray[np.int64]]:
+    """Sizes (in unknowns) of the breadth-first levels from `seeds`, and the nodes level by level."""
+    graph = _graph(mesh, free)
+    level = np.full(len(free), -1)
+    current, count = seeds, 0
+    reached = np.zeros(len(free), dtype=bool)
+    while True:
+        while len(current):
+            level[current] = count
+            reached[current] = True
+            count += 1
+            near = np.unique(graph[current].indices)
+            current = near[~reached[near]]
+        rest = np.flatnonzero(~reached)
+        if not len(rest):
+            break
+        current = rest[:1]  # a part that hangs together with nothing yet reached
+    sizes = [3 * int(n) for n in np.bincount(level)]
+    return sizes, free[np.argsort(level, kind="stable")]
+
+
+def _together(tasks: list[Callable[[], Any]]) -> list[Any]:
+    """Results of tasks that release the interpreter, on as many threads as the kernels use."""
+    threads = min(numba.get_num_threads(), len(tasks))
+    with _BLAS.limit(limits=1, user_api="blas"):
+        if threads <= 1:
+            return [task() for task in tasks]
+        with ThreadPoolExecutor(threads) as pool:
+            return list(pool.map(lambda task: task(), tasks))
+
+
+def linear_solver(mesh: HexMesh, fixed: NDArray[np.int64]) -> LinearSolver:
+    """The solver that is faster for a mesh (see `make bench-simulator`)."""
+    banded = Banded(mesh, fixed)
+    return banded if banded.unknowns.width <= WIDEST_BAND else Levels(mesh, fixed)
+
+
+def solve_indefinite(unknowns: Unknowns, stiffness: Array, diagonal: Array, right: Array) -> Array:
+    """Solutions (C, n) of one trajectory's symmetric system that no Cholesky factor exists for."""
+    return splu(unknowns.sparse(stiffness, diagonal).tocsc()).solve(right.T).T

@@ -1,0 +1,146 @@
+"""Newton's method for one implicit step or one static equilibrium of a batch of bodies."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rafl.engine import Engine
+from rafl.linear import Factors
+from rafl.resistance import Resistance
+
+Array = NDArray[Any]
+
+TOLERANCE = 1e-10  # largest nodal residual accepted [N]
+ROUNDING = 8.0 * np.finfo(float).eps  # relative error allowed for in positions
+MAX_ITERATIONS = 200
+REUSE = 0.1  # an old factor is kept while each step it gives shrinks the residual at least this much
+
+
+class SimulationError(Exception):
+    """A step or an equilibrium that could not be solved: says which, how far it came, what to try."""
+
+
+def minimise(
+    engine: Engine,
+    start: Array,
+    inertia: Array,
+    target: Array,
+    force: Array,
+    resistance: Resistance,
+    what: str = "step",
+    factors: Factors | None = None,
+) -> Array:
+    """Positions minimising sum inertia/2 |q - target|^2 - force . q + the body's energy.
+
+    Each trajectory of the batch goes its own way to a residual of 1e-10 N, or to what rounding of the
+    positions alone makes where that is more. A factor is used again while it contracts well; a new one
+    is made of the exact tangent where the iterate then is, or of its positive semi-definite projection
+    where that is indefinite, and its step is shortened until the energy falls.
+
+    Args:
+        engine: the arithmetic.
+        start: first guess, held nodes where they shall be [m], (B, N, 3).
+        inertia: [kg/s^2], (B, N); zero for a static equilibrium.
+        target: [m], (B, N, 3).
+        force: nodal forces [N], (B, N, 3).
+        resistance: of each trajectory.
+        what: named in the error.
+        factors: those of the step before; used and replaced.
+
+    Returns:
+        Positions [m], (B, N, 3).
+
+    Raises:
+        SimulationError: no convergence; names trajectory, residual and what to try.
+    """
+    q = start.copy()
+    batch = len(q)
+    free = engine.free_index
+    factors = factors or engine.allocate(batch)
+    diagonal = np.repeat(inertia, 3, axis=1)[:, free]
+
+    def objective(rows: Array, at: Array) -> tuple[Array, Array, Array]:
+        energy, gradient, _ = engine.terms(at, resistance.rows(rows), tangent=False)
+        gap = at - target[rows]
+        pull = inertia[rows][:, :, None] * gap
+        inertial = 0.5 * (pull * gap).sum(axis=(1, 2))
+        work = (force[rows] * at).sum(axis=(1, 2))
+        size = np.abs(energy) + inertial + np.abs(work)
+        return energy + inertial - work, size, (gradient + pull - force[rows]).reshape(len(rows), -1)[:, free]
+
+    def moved(rows: Array, step: Array) -> Array:
+        trial = q[rows].reshape(len(rows), -1)
+        trial[:, free] += step
+        return trial.reshape(len(rows), -1, 3)
+
+    stiffest = engine.stiffest(resistance.moduli)
+    reach = ROUNDING * np.abs(q).max(axis=(1, 2))  # what rounding does to positions [m]
+    energy, _, residual = objective(np.arange(batch), q)
+    largest = np.abs(residual).max(axis=1)
+    enough = np.maximum(TOLERANCE, stiffest * reach)
+    for _ in range(MAX_ITERATIONS):
+        running = np.flatnonzero(~(largest <= enough))
+        if not len(running):
+            return q
+        if not np.isfinite(largest[running]).all():
+            break
+        stale = factors.ready[running]
+        new = running[~stale]
+        if len(new):
+            _factor(engine, q[new], resistance.rows(new), factors, new, diagonal[new], what, largest[new])
+        step = -engine.solve(factors, running, residual[running][:, None])[:, 0]
+        slope = (step * residual[running]).sum(axis=1)
+        length = np.ones(len(running))
+        pending = np.arange(len(running))
+        for _ in range(40):
+            rows = running[pending]
+            trial = moved(rows, length[pending, None] * step[pending])
+            e, parts, r = objective(rows, trial)
+            size = np.abs(r).max(axis=1)
+            # Close to the minimum energies differ by rounding only: the residual decides there.
+            slack = 1e-13 * parts + 10.0 * reach[rows] * np.sqrt(stiffest[rows] * parts)
+            level = e <= energy[rows] + slack
+            old = stale[pending]
+            accepted = np.where(
+                old,
+                level & (size <= REUSE * largest[rows]),
+                (e <= energy[rows] + 1e-4 * length[pending] * slope[pending]) | (level & (size < largest[rows])),
+            )
+            good = rows[accepted]
+            factors.ready[good] = size[accepted] <= REUSE * largest[good]
+            q[good], energy[good] = trial[accepted], e[accepted]
+            residual[good], largest[good] = r[accepted], size[accepted]
+            factors.ready[rows[old & ~accepted]] = False
+            pending = pending[~accepted & ~old]
+            if not len(pending):
+                break
+            length[pending] *= 0.5
+        if len(pending):
+            break
+    open_ = np.flatnonzero(~(largest <= enough))
+    worst = open_[np.argmax(np.where(np.isfinite(largest[open_]), largest[open_], np.inf))]
+    raise SimulationError(
+        f"{what}: trajectory {worst} did not converge (residual {largest[worst]:.3g} N, "
+        f"wanted {enough[worst]:.0e} N); try a smaller time step, more substeps or a smaller load"
+    )
+
+
+def _factor(
+    engine: Engine, q: Array, resistance: Resistance, factors: Factors, rows: Array, diagonal: Array, what: str,
+    largest: Array,
+) -> None:  # fmt: skip
+    _, _, tangents = engine.terms(q, resistance, tangent=True)
+    definite = engine.factor(factors, rows, tangents, diagonal)
+    left = np.flatnonzero(~definite)
+    if not len(left):
+        return
+    _, _, tangents = engine.terms(q[left], resistance.rows(left), tangent=True, project=True)
+    shift = 1e-9 * engine.stiffest(resistance.moduli[left])[:, None]
+    definite = engine.factor(factors, rows[left], tangents, diagonal[left] + shift)
+    if not definite.all():
+        worst = left[np.argmin(definite)]
+        raise SimulationError(
+            f"{what}: trajectory {rows[worst]}: the tangent cannot be factored (residual "
+            f"{largest[worst]:.3g} N); hold more nodes or check the material"
+        )

@@ -1,0 +1,181 @@
+"""Compare the simulator with every file of reference data in a folder.
+
+    python tests/reference/check.py ../shared/reference
+
+A line a file: its name, the largest deviation, the limit. Exits 1 where one is past its limit.
+"""
+
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rafl.features import GaussPoints, features
+from rafl.material import Material, lame
+from rafl.mesh import HexMesh
+from rafl.newton import SimulationError
+from rafl.residual import ResidualField
+from rafl.rollout import Start, rollout
+from rafl.simulator import Simulator
+
+TRAJECTORY_LIMIT = 1e-9  # m
+GRADIENT_LIMIT = 1e-6  # of the largest component
+FIELD_LIMIT = 1e-9  # of the largest component
+
+
+@dataclass(frozen=True)
+class Deviation:
+    """How far one quantity of a file is from ours."""
+
+    what: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        return self.value <= self.limit
+
+
+def simulator_of(data: dict[str, np.ndarray]) -> Simulator:
+    mesh = HexMesh(data["vertices"], data["hexes"].astype(np.int64))
+    material = Material(float(data["youngs_modulus"]), float(data["poissons_ratio"]), float(data["density"]))
+    return Simulator(mesh, material, data["fixed"].astype(np.int64), float(data["dt"]), tuple(data["gravity"]))
+
+
+def simulate(data: dict[str, np.ndarray], **leaves: Tensor) -> Tensor:
+    """Positions (T, N, 3); f_ext constant (N, 3) or by step (T - 1, N, 3)."""
+    simulator = simulator_of(data)
+    q, v, force = (
+        leaves.get(key, torch.from_numpy(value))
+        for key, value in (
+            ("q0", data["q0"] if "q0" in data else data["q"][0]),
+            ("v0", data["v0"] if "v0" in data else data["v"][0]),
+            ("f_ext", data["f_ext"]),
+        )
+    )
+    steps = len(force) if force.ndim == 3 else len(data["q"]) - 1
+    mass = data.get("node_mass", simulator.node_mass)
+    more = torch.from_numpy(np.broadcast_to(mass, simulator.node_mass.shape) - simulator.node_mass)
+    gravity = torch.tensor(simulator.gravity, dtype=torch.float64)
+    constant = more[:, None] * gravity + (force if force.ndim == 2 else 0.0)
+    loads = iter(force)
+    residual = (lambda q, v, external: next(loads)[None]) if force.ndim == 3 else None
+    values = {key: value for key, value in leaves.items() if key not in ("q0", "v0", "f_ext")}
+    start = Start(q[None], v[None], constant[None], more[None], ("reference",))
+    return rollout(simulator, start, steps, residual, simulator.parameters(**values))[0][:, 0]
+
+
+def trajectory(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
+    with torch.no_grad():
+        q = simulate(data).numpy()
+    yield Deviation("q", float(np.abs(q - data["q"]).max()), TRAJECTORY_LIMIT, "m")
+
+
+def gradient(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
+    leaves = {key: torch.tensor(data[key]).requires_grad_() for key in ("q0", "v0", "f_ext")}
+    names = ("youngs_modulus", "poissons_ratio", "gravity")
+    leaves |= {key: torch.tensor(data[key], dtype=torch.float64).requires_grad_() for key in names}
+    q = simulate(data, **leaves)
+    loss = ((q[1:] - torch.tensor(data["vertices"])) ** 2).sum()
+    loss.backward()
+    found = {"loss": loss.item()} | {f"d_{key}": leaf.grad.numpy() for key, leaf in leaves.items()}
+    # 2 mu and lambda are functions of E and nu: their derivatives follow from the two.
+    e, nu = (torch.tensor(float(data[key]), dtype=torch.float64).requires_grad_() for key in names[:2])
+    mu, lam = lame(e, nu)
+    jacobian = np.array([[float(g) for g in torch.autograd.grad(x, (e, nu), retain_graph=True)] for x in (2 * mu, lam)])
+    by_material = np.array([found["d_youngs_modulus"], found["d_poissons_ratio"]])
+    found["d_two_mu"], found["d_lambda"] = np.linalg.solve(jacobian.T, by_material)
+    free = np.setdiff1d(np.arange(len(data["vertices"])), data["fixed"])
+    for key, ours in found.items():
+        if key not in data:
+            continue
+        nodal = key in ("d_q0", "d_v0", "d_f_ext")
+        theirs, mine = (np.asarray(x)[..., free, :] if nodal else np.asarray(x) for x in (data[key], ours))
+        yield Deviation(key, float(np.abs(mine - theirs).max() / np.abs(theirs).max()), GRADIENT_LIMIT, "relative")
+
+
+def residual_field(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
+    """Features, force and their derivatives.
+
+    The files' derivatives by the weights are those of L + 2 sum(force at exact rest): two earlier
+    gradients had not been set to zero. (The last layer is linear, so sum(W4 * dL/dW4) must be L, which
+    theirs is not.) Either reading is accepted; at rest their features hold 1e-10 where a root was
+    regularised, so this one agrees to 1e-8 only.
+    """
+    mesh = HexMesh(data["vertices"], data["hexes"].astype(np.int64))
+    simulator = Simulator(mesh, Material(), mesh.face_nodes("x-min"))
+    field = ResidualField()
+    weights = list(field.parameters())
+    for number, weight in enumerate(weights):
+        weight.data = torch.tensor(data[f"W{number}"])
+    q, v = (torch.tensor(data[key])[None].requires_grad_() for key in ("q", "v"))
+    gravity = torch.tensor(simulator.gravity, dtype=torch.float64)
+    values, _ = features(q, v, GaussPoints.of(mesh, simulator.material.density), gravity)
+    none = torch.zeros_like(q)
+    force = field.on(simulator)(q, v, none)
+    by_q, by_v, *by_weights = torch.autograd.grad((force * torch.tensor(data["c"])).sum(), [q, v, *weights])
+    for what, ours, theirs in (
+        ("features", values[0], data["features"]), ("force", force[0], data["force"]),
+        ("d_q", by_q[0], data["d_q"]), ("d_v", by_v[0], data["d_v"]),
+    ):  # fmt: skip
+        difference = np.abs(ours.detach().numpy() - theirs).max()
+        yield Deviation(what, float(difference / np.abs(theirs).max()), FIELD_LIMIT, "relative")
+    rest = torch.from_numpy(mesh.vertices)[None]
+    at_rest = torch.autograd.grad(field.on(simulator)(rest, none, none).sum(), weights)
+    readings = [
+        max(
+            float(np.abs((mine + times * more).numpy() - data[f"d_W{n}"]).max() / np.abs(data[f"d_W{n}"]).max())
+            for n, (mine, more) in enumerate(zip(by_weights, at_rest, strict=True))
+        )
+        for times in (0.0, 2.0)
+    ]
+    yield Deviation("d_W", min(readings), 1e-7, "relative")
+
+
+def deviations(path: Path) -> list[Deviation] | None:
+    """Of a file's quantities; None where the file is no reference of a known kind."""
+    with np.load(path) as file:
+        data = dict(file)
+    for mark, compare in (("features", residual_field), ("d_q0", gradient), ("f_ext", trajectory)):
+        if mark in data:
+            return list(compare(data))
+    return None
+
+
+def main() -> int:
+    folder = Path(sys.argv[1]) if len(sys.argv) == 2 else None
+    if folder is None or not folder.is_dir():
+        print(f"expected one folder of .npz reference files, got {' '.join(sys.argv[1:]) or 'nothing'}")
+        return 2
+    paths = sorted(folder.glob("*.npz"))
+    if not paths:
+        print(f"expected .npz reference files in {folder}, found none")
+        return 2
+    failed = False
+    for path in paths:
+        try:
+            found = deviations(path)
+        except (SimulationError, KeyError, ValueError, OSError) as error:
+            print(f"{path.name:48s} FAILED: {error}")
+            failed = True
+            continue
+        if found is None:
+            print(f"{path.name:48s} skipped: neither trajectory, gradient nor residual field")
+            continue
+        worst = max(found, key=lambda item: item.value / item.limit)
+        passed = all(item.passed for item in found)
+        failed |= not passed
+        print(
+            f"{path.name:48s} {worst.what:>10s} {worst.value:.2e} {worst.unit}, "
+            f"limit {worst.limit:.0e}{'' if passed else '  FAILED'}"
+        )
+    return int(failed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
