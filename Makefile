@@ -6,7 +6,7 @@ SHARED ?= ../shared
 # BLAS threads fight the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test lint real real-beam clean
+.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator clean
 
 install: $(VENV)/installed
 
@@ -40,6 +40,18 @@ real: install
 # The real beam, each recording held out in turn: original, SysID, RAFL.
 real-beam: install
 	$(BIN)/python tests/bench/clamped_beam.py $(SHARED)/real/clamped_beam --out build/clamped_beam
+
+# Presets of the untouched simulator beside the real beam, before and after identifying its material.
+real-presets: install
+	$(BIN)/python tests/bench/presets.py $(SHARED)/real/clamped_beam --out build/presets
+
+# Trajectories and gradients of the paper's own simulator, every file in a folder: make check-reference DIR=...
+check-reference: install
+	$(BIN)/python tests/reference/check.py $(or $(DIR),$(SHARED)/reference)
+
+# Speed of forward and backward steps beside the authors', and how it grows with mesh, batch and threads.
+bench-simulator: install
+	$(BIN)/python tests/bench/simulator.py $(SHARED)/reference
 
 clean:
 	rm -rf build $(VENV)

@@ -17,7 +17,7 @@ from capture.render import Look, Painter
 from capture.specimen import read_specimen
 from groundwork import InputError, command_line, progress, user_command, write_text
 from rafl.dataset import write_dataset
-from rafl.newton import SimulationError
+from rafl.errors import SimulationError
 
 render_app = command_line("Film simulated specimens.")
 capture_app = command_line("Build datasets.")

@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rafl.errors import SimulationError
 from rafl.markers import Markers
-from rafl.newton import SimulationError
 from rafl.simulator import Simulator
 
 Array = NDArray[Any]

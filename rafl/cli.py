@@ -11,9 +11,9 @@ from rich.table import Table
 
 from groundwork import InputError, command_line, progress, user_command, write_text
 from rafl.dataset import Dataset, read_dataset
+from rafl.errors import SimulationError
 from rafl.evaluation import Comparison, compare, error_table, held_out_errors, split_table
 from rafl.fit import fit_residual_field, training_recordings
-from rafl.newton import SimulationError
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
 from rafl.sysid import identify_material

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rafl.elements import element_terms, multiply
 from rafl.laws import LAWS
-from rafl.linear import Factors, LinearSolver, linear_solver, solve_indefinite
+from rafl.linear import Factors, LinearSolver, linear_solver
 from rafl.mesh import HexMesh, Quadrature
 from rafl.resistance import Resistance
 
@@ -113,7 +113,7 @@ class Compiled:
         if definite.any():
             solution[definite] = self.solve(factors, rows[definite], right[definite])
         for t in np.flatnonzero(~definite):
-            solution[t] = solve_indefinite(self.linear.unknowns, tangents[t], diagonal[t], right[t])
+            solution[t] = self.linear.solve_indefinite(tangents[t], diagonal[t], right[t])
         return solution
 
     @cached_property

@@ -10,8 +10,8 @@ import torch
 
 from groundwork import InputError
 from rafl.dataset import Dataset, Trajectory
+from rafl.errors import SimulationError
 from rafl.features import GaussPoints, features
-from rafl.newton import SimulationError
 from rafl.objective import Recordings, frame_errors, training_loss
 from rafl.residual import ResidualField
 from rafl.rollout import rollout

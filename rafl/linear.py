@@ -12,19 +12,24 @@ from typing import Any, Protocol
 
 import numba
 import numpy as np
+import pyamg
 from numpy.typing import NDArray
+from scipy import sparse
 from scipy.linalg import blas, lapack
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import cg, minres, splu
 from threadpoolctl import ThreadpoolController
 
 from rafl.band import factor_bands, scatter, solve_bands
+from rafl.errors import SimulationError
 from rafl.mesh import HexMesh
 
 Array = NDArray[Any]
 
 WIDEST_BAND = 260  # beyond it blocks of levels win
+MOST_WORK = 1e11  # multiplications to factor; beyond it multigrid wins
+ITERATIVE_TOLERANCE = 1e-10  # of the right side
 
 _BLAS = ThreadpoolController()
 
@@ -56,6 +61,9 @@ class LinearSolver(Protocol):
 
     def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
         """Solutions (R, C, n) of right sides (R, C, n)."""
+
+    def solve_indefinite(self, stiffness: Array, diagonal: Array, right: Array) -> Array:
+        """Solutions (C, n) of one trajectory's system that no Cholesky factor exists for."""
 
 
 class Unknowns:
@@ -158,6 +166,10 @@ class Banded:
         solve_bands(factors.storage, self.unknowns.width, rows, x)
         return x
 
+    def solve_indefinite(self, stiffness: Array, diagonal: Array, right: Array) -> Array:
+        """Solutions (C, n) of one trajectory's system that no Cholesky factor exists for."""
+        return _solve_by_pivoting(self.unknowns, stiffness, diagonal, right)
+
 
 @dataclass(frozen=True)
 class _Level:
@@ -183,6 +195,7 @@ class Levels:
         self.unknowns = Unknowns(mesh, order)
         self.free_index = self.unknowns.free_index
         self._cells = len(mesh.hexes)
+        self.work = _work(sizes)
         ends = np.cumsum(sizes)
         levels, place = [], 0
         for k, size in enumerate(sizes):
@@ -300,6 +313,10 @@ class Levels:
 
         return np.stack(_together([partial(one, r) for r in range(len(rows))]))
 
+    def solve_indefinite(self, stiffness: Array, diagonal: Array, right: Array) -> Array:
+        """Solutions (C, n) of one trajectory's system that no Cholesky factor exists for."""
+        return _solve_by_pivoting(self.unknowns, stiffness, diagonal, right)
+
 
 def _length(level: _Level) -> int:
     return level.unknowns.stop - level.unknowns.start
@@ -353,12 +370,74 @@ def _together(tasks: list[Callable[[], Any]]) -> list[Any]:
             return list(pool.map(lambda task: task(), tasks))
 
 
+class Iterative:
+    """Conjugate gradients on a sparse matrix, preconditioned by smoothed aggregation multigrid.
+
+    The multigrid knows the six rigid motions, so its iterations hardly grow with the mesh.
+    """
+
+    def __init__(self, mesh: HexMesh, fixed: NDArray[np.int64]) -> None:
+        self.unknowns = Unknowns(mesh, _free(mesh, fixed))
+        self.free_index = self.unknowns.free_index
+        x, y, z = (mesh.vertices[self.unknowns.order] - mesh.vertices.mean(0)).T
+        zero = np.zeros_like(x)
+        turns = np.array([[zero, -z, y], [z, zero, -x], [-y, x, zero]])  # (3 axes, 3 components, nodes)
+        self._rigid = np.concatenate(
+            [np.tile(np.eye(3), (len(x), 1)), turns.transpose(2, 1, 0).reshape(-1, 3) / np.ptp(mesh.vertices)], axis=1
+        )
+
+    def allocate(self, batch: int) -> Factors:
+        """Room for the matrices of a batch and their multigrids."""
+        return Factors([None] * batch, np.zeros(batch, dtype=bool))
+
+    def factor(self, factors: Factors, rows: Array, stiffness: Array, diagonal: Array) -> NDArray[np.bool_]:
+        """Set up `rows` of the batch; False where a diagonal is not positive."""
+        definite = np.empty(len(rows), dtype=bool)
+        for r, row in enumerate(rows):
+            matrix = self.unknowns.sparse(stiffness[r], diagonal[r])
+            definite[r] = matrix.diagonal().min() > 0.0
+            if definite[r]:
+                grids = pyamg.smoothed_aggregation_solver(
+                    matrix.tobsr((3, 3)), B=self._rigid, strength=("symmetric", {"theta": 0.0}),
+                    smooth="jacobi", improve_candidates=None, max_coarse=300,
+                )  # fmt: skip
+                factors.storage[row] = matrix, grids.aspreconditioner()
+        factors.ready[rows] = definite
+        return definite
+
+    def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
+        """Solutions (R, C, n) of right sides (R, C, n).
+
+        Raises:
+            SimulationError: conjugate gradients did not converge; the matrix may be indefinite.
+        """
+        out = np.empty_like(right)
+        for r, row in enumerate(rows):
+            matrix, grids = factors.storage[row]
+            for c, load in enumerate(right[r]):
+                out[r, c], failed = cg(matrix, load, rtol=ITERATIVE_TOLERANCE, M=grids, maxiter=300)
+                if failed:
+                    raise SimulationError(
+                        f"conjugate gradients on {len(load)} unknowns did not converge: the body may be about to "
+                        "buckle; try a smaller time step or load"
+                    )
+        return out
+
+    def solve_indefinite(self, stiffness: Array, diagonal: Array, right: Array) -> Array:
+        """Solutions (C, n) of one trajectory's system that no Cholesky factor exists for."""
+        matrix = self.unknowns.sparse(stiffness, diagonal)
+        scale = sparse.diags_array(1.0 / np.abs(matrix.diagonal()))
+        return np.stack([minres(matrix, load, rtol=ITERATIVE_TOLERANCE, M=scale, maxiter=100_000)[0] for load in right])
+
+
 def linear_solver(mesh: HexMesh, fixed: NDArray[np.int64]) -> LinearSolver:
-    """The solver that is faster for a mesh (see `make bench-simulator`)."""
+    """The solver that is fastest for a mesh (see `make bench-simulator`)."""
     banded = Banded(mesh, fixed)
-    return banded if banded.unknowns.width <= WIDEST_BAND else Levels(mesh, fixed)
+    if banded.unknowns.width <= WIDEST_BAND:
+        return banded
+    levels = Levels(mesh, fixed)
+    return levels if levels.work <= MOST_WORK else Iterative(mesh, fixed)
 
 
-def solve_indefinite(unknowns: Unknowns, stiffness: Array, diagonal: Array, right: Array) -> Array:
-    """Solutions (C, n) of one trajectory's symmetric system that no Cholesky factor exists for."""
+def _solve_by_pivoting(unknowns: Unknowns, stiffness: Array, diagonal: Array, right: Array) -> Array:
     return splu(unknowns.sparse(stiffness, diagonal).tocsc()).solve(right.T).T

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.engine import Engine
+from rafl.errors import SimulationError
 from rafl.linear import Factors
 from rafl.resistance import Resistance
 
@@ -15,10 +16,6 @@ TOLERANCE = 1e-10  # largest nodal residual accepted [N]
 ROUNDING = 8.0 * np.finfo(float).eps  # relative error allowed for in positions
 MAX_ITERATIONS = 200
 REUSE = 0.1  # an old factor is kept while each step it gives shrinks the residual at least this much
-
-
-class SimulationError(Exception):
-    """A step or an equilibrium that could not be solved: says which, how far it came, what to try."""
 
 
 def minimise(

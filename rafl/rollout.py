@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rafl.errors import SimulationError
 from rafl.implicit import InternalForce, Minimum, Setting
 from rafl.integrator import INTEGRATORS, Problem, State, green_strain
-from rafl.newton import SimulationError
 from rafl.parameters import Parameters
 from rafl.simulator import Simulator
 

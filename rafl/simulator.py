@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from rafl.compiled import Compiled
 from rafl.engine import Engine
+from rafl.errors import SimulationError
 from rafl.integrator import INTEGRATORS
 from rafl.linear import Factors
 from rafl.material import Material
 from rafl.mesh import HexMesh
-from rafl.newton import SimulationError, minimise
+from rafl.newton import minimise
 from rafl.parameters import Parameters
 from rafl.plain import Plain
 from rafl.resistance import Resistance

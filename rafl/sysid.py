@@ -7,8 +7,8 @@ import torch
 from scipy.optimize import minimize
 
 from rafl.dataset import Dataset
+from rafl.errors import SimulationError
 from rafl.fit import Report, mean_error, shortened, training_recordings
-from rafl.newton import SimulationError
 from rafl.objective import training_loss
 from rafl.run import FittedModel, Settings, read_history, save_model, write_history
 

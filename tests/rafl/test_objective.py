@@ -57,4 +57,4 @@ def test_tables(dataset: Dataset) -> None:
     assert train["std_mm"] == pytest.approx(1e3 * pooled.std())
     held_out = rows.query("recording == 'd' and method == 'original'")["mean_mm"].iloc[0]
     assert 1e3 * held_out_errors(comparisons)["original"] == pytest.approx(held_out)
-    assert held_out > 0.5
+    assert held_out > 0.3

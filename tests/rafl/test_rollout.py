@@ -4,12 +4,12 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from rafl.errors import SimulationError
 from rafl.integrator import INTEGRATORS as INTEGRATOR_OF
 from rafl.integrator import State
 from rafl.laws import LAWS
 from rafl.material import Material
 from rafl.mesh import HexMesh
-from rafl.newton import SimulationError
 from rafl.rollout import Start, equilibrium, rollout
 from rafl.simulator import Simulator
 

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
+from rafl.errors import SimulationError
 from rafl.material import PRESETS, Material
 from rafl.mesh import HexMesh
-from rafl.newton import SimulationError
 from rafl.resistance import Resistance
 from rafl.simulator import Simulator
 

@@ -35,4 +35,4 @@ def test_a_fitted_material_beats_the_assumed_one_on_the_held_out_recording(run: 
     result = run("rafl-eval", "sysid", "beam.h5")
     assert result.returncode == 0, result.stderr
     errors = pd.read_csv(tmp_path / "sysid" / "errors.csv").query("split == 'test'").set_index("method")
-    assert errors["mean_mm"]["sysid"] < 0.6 * errors["mean_mm"]["original"]
+    assert errors["mean_mm"]["sysid"] < 0.7 * errors["mean_mm"]["original"]

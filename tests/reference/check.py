@@ -14,10 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from rafl.errors import SimulationError
 from rafl.features import GaussPoints, features
 from rafl.material import Material, lame
 from rafl.mesh import HexMesh
-from rafl.newton import SimulationError
 from rafl.residual import ResidualField
 from rafl.rollout import Start, rollout
 from rafl.simulator import Simulator
