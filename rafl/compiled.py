@@ -1,8 +1,11 @@
 """The simulator's arithmetic in compiled kernels, on the processor's cores."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import cached_property
 from typing import Any
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +16,8 @@ from rafl.mesh import HexMesh, Quadrature
 from rafl.resistance import Resistance
 
 Array = NDArray[Any]
+
+CELLS_FOR_TWO = 170  # in a batch, below which one thread is as fast as two
 
 
 class Compiled:
@@ -42,6 +47,17 @@ class Compiled:
         self._by_point = np.ascontiguousarray(points.transpose(0, 1, 3, 4, 2)).reshape(cells, groups, 192)
         self._by_node = np.ascontiguousarray(points.transpose(0, 1, 2, 4, 3)).reshape(cells, groups, 192)
         self._volume = np.ascontiguousarray(np.stack(volume, axis=1))
+
+    @contextmanager
+    def _threads(self, batch: int) -> Iterator[None]:
+        """One thread where little is to be done: two would spend longer waiting than working."""
+        before = numba.get_num_threads()
+        if batch * len(self.mesh.hexes) < CELLS_FOR_TWO:
+            numba.set_num_threads(1)
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)
 
     @cached_property
     def points(self) -> Quadrature:
@@ -77,19 +93,21 @@ class Compiled:
         energy, gradient = np.empty(batch), np.empty_like(q)
         stiffness = np.empty((batch if tangent else 0, len(self.mesh.hexes), 6, 8, 8))
         none = np.zeros((1, 1, 1, 1))
-        element_terms(
-            q, self.mesh.hexes, self._by_point, self._by_node, self._volume, self.shares, self.law,
-            resistance.moduli, resistance.damped,
-            none[0] if resistance.drift is None else resistance.drift,
-            none if resistance.strain is None else resistance.strain,
-            resistance.rate, resistance.strain_rate, project, tangent, energy, gradient, stiffness,
-        )  # fmt: skip
+        with self._threads(batch):
+            element_terms(
+                q, self.mesh.hexes, self._by_point, self._by_node, self._volume, self.shares, self.law,
+                resistance.moduli, resistance.damped,
+                none[0] if resistance.drift is None else resistance.drift,
+                none if resistance.strain is None else resistance.strain,
+                resistance.rate, resistance.strain_rate, project, tangent, energy, gradient, stiffness,
+            )  # fmt: skip
         return energy, gradient, stiffness
 
     def multiply(self, tangents: Array, x: Array) -> Array:
         """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
         out = np.empty_like(x)
-        multiply(tangents, self.mesh.hexes, x, out)
+        with self._threads(len(x)):
+            multiply(tangents, self.mesh.hexes, x, out)
         return out
 
     def allocate(self, batch: int) -> Factors:
@@ -98,11 +116,13 @@ class Compiled:
 
     def factor(self, factors: Factors, rows: Array, tangents: Array, diagonal: Array) -> NDArray[np.bool_]:
         """Factor tangents plus a diagonal (R, n) into `rows`; True where positive definite."""
-        return self.linear.factor(factors, rows, tangents, diagonal)
+        with self._threads(len(rows)):
+            return self.linear.factor(factors, rows, tangents, diagonal)
 
     def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
         """Solutions (R, C, n) of right sides (R, C, n)."""
-        return self.linear.solve(factors, rows, right)
+        with self._threads(len(rows)):
+            return self.linear.solve(factors, rows, right)
 
     def solve_once(self, tangents: Array, diagonal: Array, right: Array) -> Array:
         """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""

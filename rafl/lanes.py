@@ -79,21 +79,31 @@ def weighted_rows(count: int, weight_stride: int, row_stride: int, *, add: bool 
 
 
 def add_rows(count: int) -> Any:
-    """Compiled (out, o, weights, i, rows, j, stride): out[o:o+8] += sum_m weights[i + m] rows[j + m stride: +8]."""
+    """Compiled (out, o, weights, i, rows, j, stride, n).
+
+    For n places, eight at a time and up to seven more: out[o + k] += sum_m weights[i + m] rows[j + m stride + k].
+    """
 
     @intrinsic
-    def function(typing: Any, out: Any, o: Any, weights: Any, i: Any, rows: Any, j: Any, stride: Any) -> Any:
+    def function(typing: Any, out: Any, o: Any, weights: Any, i: Any, rows: Any, j: Any, stride: Any, n: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             kinds = signature.args
-            target, by, first = (_Rows(context, builder, kinds[k], args[k], args[k + 1]) for k in (0, 2, 4))
-            total = target.load(0)
-            for m in range(count):
-                total = _add_product(builder, total, by.spread(m), first.load(0))
-                first.start = builder.gep(first.start, [args[6]])
-            target.store(total, 0)
+            by = _Rows(context, builder, kinds[2], args[2], args[3])
+            factors = [by.spread(m) for m in range(count)]
+            step, places = ir.Constant(args[7].type, LANES), args[7]
+            blocks = builder.sdiv(builder.add(places, ir.Constant(places.type, LANES - 1)), step)
+            with cgutils.for_range(builder, blocks) as loop:
+                shift = builder.mul(loop.index, step)
+                target = _Rows(context, builder, kinds[0], args[0], builder.add(args[1], shift))
+                first = _Rows(context, builder, kinds[4], args[4], builder.add(args[5], shift))
+                total = target.load(0)
+                for factor in factors:
+                    total = _add_product(builder, total, factor, first.load(0))
+                    first.start = builder.gep(first.start, [args[6]])
+                target.store(total, 0)
             return context.get_dummy_value()
 
-        return types.void(out, types.intp, weights, types.intp, rows, types.intp, types.intp), codegen
+        return types.void(out, types.intp, weights, types.intp, rows, types.intp, types.intp, types.intp), codegen
 
     return function
 

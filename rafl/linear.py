@@ -21,8 +21,9 @@ from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import cg, minres, splu
 from threadpoolctl import ThreadpoolController
 
-from rafl.band import factor_bands, scatter, solve_bands
+from rafl.band import allocate, column_length, factor_bands, scatter, solve_bands
 from rafl.errors import SimulationError
+from rafl.lanes import LANES
 from rafl.mesh import HexMesh
 
 Array = NDArray[Any]
@@ -72,8 +73,8 @@ class Unknowns:
     Attributes:
         order: free nodes in the order of their unknowns.
         free_index: flat indices into (N * 3) of the unknowns, in order, (n).
-        rows, columns: of the entries of every cell, row >= column; -1 where one is held or counted
-            already, (E, 384).
+        entries: which of the cells' (E * 384) entries count: neither held nor there twice, (M).
+        rows, columns: of those entries, row >= column, (M).
     """
 
     def __init__(self, mesh: HexMesh, order: NDArray[np.int64]) -> None:
@@ -91,8 +92,10 @@ class Unknowns:
                     counts = counts & np.tri(8, dtype=bool)
                 rows.append(np.where(counts, np.maximum(row, column), -1).reshape(len(at), 64))
                 columns.append(np.where(counts, np.minimum(row, column), -1).reshape(len(at), 64))
-        self.rows = np.concatenate(rows, axis=1)
-        self.columns = np.concatenate(columns, axis=1)
+        flat = np.concatenate(rows, axis=1).ravel()
+        self.entries = np.flatnonzero(flat >= 0)
+        self.rows = flat[self.entries]
+        self.columns = np.concatenate(columns, axis=1).ravel()[self.entries]
 
     @property
     def count(self) -> int:
@@ -106,9 +109,8 @@ class Unknowns:
 
     def sparse(self, stiffness: Array, diagonal: Array) -> csr_array:
         """One trajectory's matrix, both triangles."""
-        rows, columns, values = self.rows.ravel(), self.columns.ravel(), stiffness.reshape(-1)
-        kept = rows >= 0
-        lower = coo_array((values[kept], (rows[kept], columns[kept])), shape=(self.count, self.count)).tocsr()
+        values = stiffness.reshape(-1)[self.entries]
+        lower = coo_array((values, (self.rows, self.columns)), shape=(self.count, self.count)).tocsr()
         lower.setdiag(0.5 * (lower.diagonal() + diagonal))
         return (lower + lower.T).tocsr()
 
@@ -137,25 +139,26 @@ class Banded:
         longest_last = np.argsort(np.ptp(mesh.vertices, axis=0), kind="stable")
         sliced = free[np.lexsort(places[:, longest_last].T)]
         self.unknowns = min((Unknowns(mesh, order) for order in (sliced, permuted)), key=lambda u: u.width)
+        self._length = column_length(self.unknowns.width)
         self.free_index = self.unknowns.free_index
-        self._cells = len(mesh.hexes)
 
     @cached_property
     def _destination(self) -> NDArray[np.int32]:
         rows, columns = self.unknowns.rows, self.unknowns.columns
-        return np.where(rows >= 0, columns * self.unknowns.width + rows - columns, -1).astype(np.int32)
+        start = LANES * (columns // LANES)
+        return (columns * self._length + rows - start).astype(np.int32)
 
     def allocate(self, batch: int) -> Factors:
         """Room for the factors of a batch."""
-        size = self.unknowns.count * self.unknowns.width + 8
-        return Factors(np.zeros((batch, size)), np.zeros(batch, dtype=bool))
+        bands = allocate(batch, self.unknowns.count, self.unknowns.width)
+        return Factors(bands, np.zeros(batch, dtype=bool))
 
     def factor(self, factors: Factors, rows: Array, stiffness: Array, diagonal: Array) -> NDArray[np.bool_]:
         """Factor `rows` of the batch; True where the matrix was positive definite."""
         pivots = np.empty(len(rows))
         factor_bands(
-            stiffness.reshape(len(rows), self._cells, 384), diagonal, self._destination, rows, factors.storage,
-            self.unknowns.width, pivots,
+            stiffness.reshape(len(rows), -1), diagonal, self.unknowns.entries, self._destination, rows,
+            factors.storage, self._length, pivots,
         )  # fmt: skip
         factors.ready[rows] = pivots > 0.0
         return pivots > 0.0
@@ -163,7 +166,7 @@ class Banded:
     def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
         """Solutions (R, C, n) of right sides (R, C, n)."""
         x = np.ascontiguousarray(right).copy()
-        solve_bands(factors.storage, self.unknowns.width, rows, x)
+        solve_bands(factors.storage, self._length, rows, x)
         return x
 
     def solve_indefinite(self, stiffness: Array, diagonal: Array, right: Array) -> Array:
@@ -194,7 +197,6 @@ class Levels:
         )
         self.unknowns = Unknowns(mesh, order)
         self.free_index = self.unknowns.free_index
-        self._cells = len(mesh.hexes)
         self.work = _work(sizes)
         ends = np.cumsum(sizes)
         levels, place = [], 0
@@ -220,7 +222,7 @@ class Levels:
         low, high = level_of[columns], level_of[rows]
         inside = own[low] + (columns - start[low]) * length[low] + rows - start[low]
         across = up[low] + (columns - start[low]) * length[high] + rows - start[high]
-        return np.where(rows < 0, -1, np.where(low == high, inside, across))
+        return np.where(low == high, inside, across)
 
     def allocate(self, batch: int) -> Factors:
         """Room for the factors of a batch."""
@@ -237,7 +239,7 @@ class Levels:
 
     def factor(self, factors: Factors, rows: Array, stiffness: Array, diagonal: Array) -> NDArray[np.bool_]:
         """Factor `rows` of the batch; True where the matrix was positive definite."""
-        scatter(stiffness.reshape(len(rows), self._cells, 384), self._destination, rows, factors.storage)
+        scatter(stiffness.reshape(len(rows), -1), self.unknowns.entries, self._destination, rows, factors.storage)
         last, middle = len(self._levels) - 1, self._middle
 
         def prepare(row: int) -> tuple[list[Array], list[Array]]:
