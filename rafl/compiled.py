@@ -33,6 +33,7 @@ class Compiled:
     def __init__(self, mesh: HexMesh, law: str, integration: str, fixed: NDArray[np.int64]) -> None:
         self.mesh = mesh
         self.fixed = fixed
+        self._room: Factors | None = None  # of `solve_once`, which is called again and again
         self.law = list(LAWS).index(law)
         rule = mesh.quadrature
         gradient, volume = [rule.gradient], [rule.volume]
@@ -46,6 +47,7 @@ class Compiled:
         points = np.stack(gradient, axis=1)  # (E, G, 8 points, 8 nodes, 3)
         self._by_point = np.ascontiguousarray(points.transpose(0, 1, 3, 4, 2)).reshape(cells, groups, 192)
         self._by_node = np.ascontiguousarray(points.transpose(0, 1, 2, 4, 3)).reshape(cells, groups, 192)
+        self._touching = np.flatnonzero(np.isin(mesh.hexes, fixed).any(axis=1))
         self._volume = np.ascontiguousarray(np.stack(volume, axis=1))
 
     @contextmanager
@@ -107,8 +109,20 @@ class Compiled:
         """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
         out = np.empty_like(x)
         with self._threads(len(x)):
-            multiply(tangents, self.mesh.hexes, x, out)
+            multiply(tangents, np.arange(len(self.mesh.hexes)), self.mesh.hexes, x, out)
         return out
+
+    def reactions(self, tangents: Array, x: Array) -> Array:
+        """Tangent times x (B, N, 3) on the held nodes, (B, F, 3)."""
+        out = np.empty_like(x)
+        with self._threads(len(x)):
+            multiply(tangents, self._touching, self.mesh.hexes, x, out)
+        return out[:, self.fixed]
+
+    @property
+    def patience(self) -> float:
+        """How many steps with an old factor cost as much as a new one."""
+        return self.linear.patience
 
     def allocate(self, batch: int) -> Factors:
         """Room for the factors of a batch."""
@@ -127,7 +141,9 @@ class Compiled:
     def solve_once(self, tangents: Array, diagonal: Array, right: Array) -> Array:
         """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""
         rows = np.arange(len(right))
-        factors = self.allocate(len(right))
+        if self._room is None or len(self._room.ready) != len(right):
+            self._room = self.allocate(len(right))
+        factors = self._room
         definite = self.factor(factors, rows, tangents, diagonal)
         solution = np.empty_like(right)
         if definite.any():

@@ -315,11 +315,11 @@ def element_terms(
 
 
 @njit(parallel=True, **KERNEL)
-def multiply(stiffness, hexes, x, out):  # type: ignore[no-untyped-def]
-    """Fill out (B, N, 3) with the cells' stiffnesses (B, E, 6, 8, 8) times x (B, N, 3)."""
+def multiply(stiffness, cells, hexes, x, out):  # type: ignore[no-untyped-def]
+    """Fill out (B, N, 3) with the stiffnesses (B, E, 6, 8, 8) of some cells times x (B, N, 3)."""
     for t in prange(x.shape[0]):
         out[t] = 0.0
-        for e in range(hexes.shape[0]):
+        for e in cells:
             for i in range(3):
                 for k in range(i + 1):
                     block = i * (i + 1) // 2 + k

@@ -21,6 +21,10 @@ class Engine(Protocol):
         """Flat indices into (N * 3) of the unknowns, in the solver's order, (n)."""
 
     @property
+    def patience(self) -> float:
+        """How many steps with an old factor cost as much as a new one."""
+
+    @property
     def points(self) -> Quadrature:
         """Every integration point, those of no weight included."""
 
@@ -39,6 +43,9 @@ class Engine(Protocol):
 
     def multiply(self, tangents: Any, x: Array) -> Array:
         """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
+
+    def reactions(self, tangents: Any, x: Array) -> Array:
+        """Tangent times x (B, N, 3) on the held nodes, (B, F, 3)."""
 
     def allocate(self, batch: int) -> Factors:
         """Room for the factors of a batch."""

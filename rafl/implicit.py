@@ -86,8 +86,7 @@ class Minimum(torch.autograd.Function):
         by = torch.from_numpy(adjoint)
         by_held = by_moduli = by_drift = by_strain = None
         if needs[3]:
-            pulled = grad.numpy() - engine.multiply(tangents, adjoint)
-            by_held = torch.from_numpy(pulled[:, simulator.fixed])
+            by_held = torch.from_numpy(grad.numpy()[:, simulator.fixed] - engine.reactions(tangents, adjoint))
         if needs[4]:
             by_moduli = torch.from_numpy(_by_moduli(engine, q, resistance, adjoint))
         if resistance.damped and (needs[5] or needs[6]):

@@ -15,12 +15,12 @@ import numpy as np
 import pyamg
 from numpy.typing import NDArray
 from scipy import sparse
-from scipy.linalg import blas, lapack
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import reverse_cuthill_mckee
 from scipy.sparse.linalg import cg, minres, splu
 from threadpoolctl import ThreadpoolController
 
+from rafl import blas
 from rafl.band import allocate, column_length, factor_bands, scatter, solve_bands
 from rafl.errors import SimulationError
 from rafl.lanes import LANES
@@ -28,7 +28,6 @@ from rafl.mesh import HexMesh
 
 Array = NDArray[Any]
 
-WIDEST_BAND = 260  # beyond it blocks of levels win
 MOST_WORK = 1e11  # multiplications to factor; beyond it multigrid wins
 ITERATIVE_TOLERANCE = 1e-10  # of the right side
 
@@ -53,6 +52,7 @@ class LinearSolver(Protocol):
 
     free_index: NDArray[np.int64]
     unknowns: "Unknowns"
+    patience: float  # how many steps with an old factor cost as much as a new one
 
     def allocate(self, batch: int) -> Factors:
         """Room for the factors of a batch."""
@@ -132,6 +132,8 @@ class Banded:
     Slices across the longest side and reverse Cuthill-McKee are both tried; the narrower band wins.
     """
 
+    patience = 5.0
+
     def __init__(self, mesh: HexMesh, fixed: NDArray[np.int64]) -> None:
         free = _free(mesh, fixed)
         permuted = free[reverse_cuthill_mckee(_graph(mesh, free), symmetric_mode=True)]
@@ -140,6 +142,7 @@ class Banded:
         sliced = free[np.lexsort(places[:, longest_last].T)]
         self.unknowns = min((Unknowns(mesh, order) for order in (sliced, permuted)), key=lambda u: u.width)
         self._length = column_length(self.unknowns.width)
+        self.work = float(self.unknowns.count) * self.unknowns.width**2
         self.free_index = self.unknowns.free_index
 
     @cached_property
@@ -189,6 +192,8 @@ class Levels:
     The blocks are the level sets of the mesh's graph as seen from the held nodes, so a body with a
     thin waist costs what its sections cost and not what its thickest does.
     """
+
+    patience = 7.0
 
     def __init__(self, mesh: HexMesh, fixed: NDArray[np.int64]) -> None:
         free = _free(mesh, fixed)
@@ -253,21 +258,21 @@ class Levels:
         def downward(row: int) -> bool:
             own, up = blocks[row]
             for k in range(middle):
-                if lapack.dpotrf(own[k], lower=1, clean=0, overwrite_a=1)[1] != 0:
+                if not blas.cholesky(own[k]):
                     return False
-                blas.dtrsm(1.0, own[k], up[k], side=1, lower=1, trans_a=1, overwrite_b=1)
+                blas.solve_triangle(own[k], up[k], transposed=True, right=True)
                 if k + 1 < middle:
-                    blas.dsyrk(-1.0, up[k], beta=1.0, c=own[k + 1], lower=1, overwrite_c=1)
+                    blas.subtract_square(own[k + 1], up[k])
             return True
 
         def upward(row: int) -> bool:
             own, up = blocks[row]
             for k in range(last, middle, -1):
-                if lapack.dpotrf(own[k], lower=1, clean=0, overwrite_a=1)[1] != 0:
+                if not blas.cholesky(own[k]):
                     return False
-                blas.dtrsm(1.0, own[k], up[k - 1], lower=1, overwrite_b=1)
+                blas.solve_triangle(own[k], up[k - 1])
                 if k - 1 > middle:
-                    blas.dsyrk(-1.0, up[k - 1], beta=1.0, c=own[k - 1], lower=1, trans=1, overwrite_c=1)
+                    blas.subtract_square(own[k - 1], up[k - 1], transposed=True)
             return True
 
         def meet(row: int) -> bool:
@@ -275,10 +280,10 @@ class Levels:
                 return False
             own, up = blocks[row]
             if middle > 0:
-                blas.dsyrk(-1.0, up[middle - 1], beta=1.0, c=own[middle], lower=1, overwrite_c=1)
+                blas.subtract_square(own[middle], up[middle - 1])
             if middle < last:
-                blas.dsyrk(-1.0, up[middle], beta=1.0, c=own[middle], lower=1, trans=1, overwrite_c=1)
-            return lapack.dpotrf(own[middle], lower=1, clean=0, overwrite_a=1)[1] == 0
+                blas.subtract_square(own[middle], up[middle], transposed=True)
+            return blas.cholesky(own[middle])
 
         every = range(len(rows))
         sides = _together([partial(side, r) for r in every for side in (downward, upward)])
@@ -290,34 +295,51 @@ class Levels:
         """Solutions (R, C, n) of right sides (R, C, n)."""
         last, middle = len(self._levels) - 1, self._middle
 
-        def one(row: int) -> Array:
-            own, up = self._blocks(factors.storage[rows[row]])
-            x = [np.asfortranarray(right[row, :, level.unknowns].T) for level in self._levels]
+        blocks = [self._blocks(factors.storage[row]) for row in rows]
+        parts = [
+            [np.asfortranarray(right[row, :, level.unknowns].T) for level in self._levels] for row in range(len(rows))
+        ]
 
-            def triangle(k: int, transposed: int) -> None:
-                x[k] = blas.dtrsm(1.0, own[k], x[k], lower=1, trans_a=transposed)
+        def inward(row: int, side: range, step: int) -> None:
+            """Forward substitution from an end up to, not into, the middle."""
+            (own, up), x = blocks[row], parts[row]
+            for k in side:
+                blas.solve_triangle(own[k], x[k])
+                if k + step != middle:
+                    _take(x[k + step], up[min(k, k + step)], x[k], step)
 
-            for k in range(middle):
-                triangle(k, 0)
-                x[k + 1] = x[k + 1] - up[k] @ x[k]
-            for k in range(last, middle, -1):
-                triangle(k, 0)
-                x[k - 1] = x[k - 1] - up[k - 1].T @ x[k]
-            triangle(middle, 0)
-            triangle(middle, 1)
-            for k in range(middle - 1, -1, -1):
-                x[k] = x[k] - up[k].T @ x[k + 1]
-                triangle(k, 1)
-            for k in range(middle + 1, last + 1):
-                x[k] = x[k] - up[k - 1] @ x[k - 1]
-                triangle(k, 1)
-            return np.concatenate(x).T
+        def meet(row: int) -> None:
+            (own, up), x = blocks[row], parts[row]
+            if middle > 0:
+                _take(x[middle], up[middle - 1], x[middle - 1], 1)
+            if middle < last:
+                _take(x[middle], up[middle], x[middle + 1], -1)
+            blas.solve_triangle(own[middle], x[middle])
+            blas.solve_triangle(own[middle], x[middle], transposed=True)
 
-        return np.stack(_together([partial(one, r) for r in range(len(rows))]))
+        def outward(row: int, side: range, step: int) -> None:
+            """Back substitution from the middle to an end."""
+            (own, up), x = blocks[row], parts[row]
+            for k in side:
+                _take(x[k], up[min(k, k - step)], x[k - step], step)
+                blas.solve_triangle(own[k], x[k], transposed=True)
+
+        every = range(len(rows))
+        inner = ((range(middle), 1), (range(last, middle, -1), -1))
+        outer = ((range(middle - 1, -1, -1), -1), (range(middle + 1, last + 1), 1))
+        _together([partial(inward, r, *side) for r in every for side in inner])
+        _together([partial(meet, r) for r in every])
+        _together([partial(outward, r, *side) for r in every for side in outer])
+        return np.stack([np.concatenate(x).T for x in parts])
 
     def solve_indefinite(self, stiffness: Array, diagonal: Array, right: Array) -> Array:
         """Solutions (C, n) of one trajectory's system that no Cholesky factor exists for."""
         return _solve_by_pivoting(self.unknowns, stiffness, diagonal, right)
+
+
+def _take(x: Array, up: Array, y: Array, step: int) -> None:
+    """Subtract the coupling of two levels times y from x, the level above where step is 1, below where -1."""
+    blas.subtract_product(x, up, y, transposed=step < 0)
 
 
 def _length(level: _Level) -> int:
@@ -378,6 +400,8 @@ class Iterative:
     The multigrid knows the six rigid motions, so its iterations hardly grow with the mesh.
     """
 
+    patience = 1.5
+
     def __init__(self, mesh: HexMesh, fixed: NDArray[np.int64]) -> None:
         self.unknowns = Unknowns(mesh, _free(mesh, fixed))
         self.free_index = self.unknowns.free_index
@@ -434,11 +458,10 @@ class Iterative:
 
 def linear_solver(mesh: HexMesh, fixed: NDArray[np.int64]) -> LinearSolver:
     """The solver that is fastest for a mesh (see `make bench-simulator`)."""
-    banded = Banded(mesh, fixed)
-    if banded.unknowns.width <= WIDEST_BAND:
-        return banded
-    levels = Levels(mesh, fixed)
-    return levels if levels.work <= MOST_WORK else Iterative(mesh, fixed)
+    banded, levels = Banded(mesh, fixed), Levels(mesh, fixed)
+    if min(banded.work, levels.work) > MOST_WORK:
+        return Iterative(mesh, fixed)
+    return banded if banded.work <= levels.work else levels
 
 
 def _solve_by_pivoting(unknowns: Unknowns, stiffness: Array, diagonal: Array, right: Array) -> Array:

@@ -15,7 +15,6 @@ Array = NDArray[Any]
 TOLERANCE = 1e-10  # largest nodal residual accepted [N]
 ROUNDING = 8.0 * np.finfo(float).eps  # relative error allowed for in positions
 MAX_ITERATIONS = 200
-REUSE = 0.1  # an old factor is kept while each step it gives shrinks the residual at least this much
 
 
 def minimise(
@@ -101,11 +100,11 @@ def minimise(
             old = stale[pending]
             accepted = np.where(
                 old,
-                level & (size <= REUSE * largest[rows]),
+                level & (size <= 0.5 * largest[rows]),
                 (e <= energy[rows] + 1e-4 * length[pending] * slope[pending]) | (level & (size < largest[rows])),
             )
             good = rows[accepted]
-            factors.ready[good] = size[accepted] <= REUSE * largest[good]
+            factors.ready[good] = _worth_keeping(size[accepted] / largest[good], size[accepted] / enough[good], engine)
             q[good], energy[good] = trial[accepted], e[accepted]
             residual[good], largest[good] = r[accepted], size[accepted]
             factors.ready[rows[old & ~accepted]] = False
@@ -121,6 +120,14 @@ def minimise(
         f"{what}: trajectory {worst} did not converge (residual {largest[worst]:.3g} N, "
         f"wanted {enough[worst]:.0e} N); try a smaller time step, more substeps or a smaller load"
     )
+
+
+def _worth_keeping(shrinking: Array, left: Array, engine: Engine) -> NDArray[np.bool_]:
+    """Whether at this pace the rest takes fewer steps than a new factor costs.
+
+    shrinking: of the residual in the last step, (R); left: residual over what is wanted, (R).
+    """
+    return np.log(np.maximum(left, 1.0)) <= -engine.patience * np.log(shrinking.clip(1e-300, 1.0))
 
 
 def _factor(

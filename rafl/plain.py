@@ -34,10 +34,13 @@ def signed_svd(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 class Plain:
     """Energy, gradient, tangent and linear solves of one mesh under one law; see `rafl.compiled.Compiled`."""
 
+    patience = 5.0
+
     def __init__(
         self, mesh: HexMesh, law: str, integration: str, fixed: NDArray[np.int64], device: str = "cpu"
     ) -> None:
         self.mesh = mesh
+        self.fixed = fixed
         self.law = LAWS[law]
         self.device = torch.device(device)
         rule = mesh.quadrature
@@ -150,6 +153,10 @@ class Plain:
     def multiply(self, tangents: Tensor, x: Array) -> Array:
         """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
         return (tangents @ self._tensor(x).reshape(len(x), -1, 1)).reshape(x.shape).cpu().numpy()
+
+    def reactions(self, tangents: Tensor, x: Array) -> Array:
+        """Tangent times x (B, N, 3) on the held nodes, (B, F, 3)."""
+        return self.multiply(tangents, x)[:, self.fixed]
 
     def _reduced(self, tangents: Tensor, diagonal: Array) -> Tensor:
         free = torch.from_numpy(self.free_index).to(self.device)

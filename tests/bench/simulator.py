@@ -7,11 +7,9 @@ Medians of rollouts, in one run; FOLDER may hold `fishtail_fine_cells.npy`, a me
 
 import argparse
 import json
-import resource
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -69,6 +67,15 @@ class Case:
         q = torch.from_numpy(loaded.equilibrium(forces))
         still = torch.zeros_like(q)
         return cls(Simulator(mesh, material, fixed), Start(q, still, still, still[..., 0], ("beam",) * batch))
+
+    @classmethod
+    def dropped(cls, mesh: HexMesh, material: Material) -> "Case":
+        """A straight beam that gravity begins to bend."""
+        q = torch.from_numpy(mesh.vertices[None])
+        still = torch.zeros_like(q)
+        return cls(
+            Simulator(mesh, material, mesh.face_nodes("x-min")), Start(q, still, still, still[..., 0], ("beam",))
+        )
 
     def milliseconds(self, steps: int, repeats: int) -> tuple[float, float]:
         """Forward and backward, a step and trajectory; the median of some rollouts."""
@@ -128,13 +135,16 @@ def speed(folder: Path | None) -> None:
             )
 
 
-def alone(what: Callable[[], dict[str, float]]) -> None:
-    """Print what a case found, and the process's peak memory."""
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    found = what()
-    found["before_mb"] = before / 1024
-    found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    print(json.dumps(found))
+def peak_mb() -> float:
+    """The most memory this process has held since `forget_peak` [MB]; Linux."""
+    status = Path("/proc/self/status").read_text()
+    return float(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1024
+
+
+def forget_peak() -> float:
+    """Start counting anew; what is held now [MB]."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return peak_mb()
 
 
 def apart(*arguments: object) -> dict[str, float]:
@@ -157,12 +167,13 @@ def growth() -> None:
 
 def grow(times: int) -> dict[str, float]:
     mesh = canonical(times)
-    case = Case.of(mesh, ORIGINAL)
-    forward, backward = case.milliseconds(20 if times < 4 else 4, 3 if times < 8 else 1)
+    case = Case.dropped(mesh, ORIGINAL)
+    held = forget_peak()
+    forward, backward = case.milliseconds(20 if times < 4 else 4, 3 if times < 4 else 1)
     solver = case.simulator.engine.linear
     return {
         "cells": len(mesh.hexes), "unknowns": len(solver.free_index), "solver": type(solver).__name__,
-        "forward": forward, "backward": backward,
+        "forward": forward, "backward": backward, "peak_mb": peak_mb() - held,
     }  # fmt: skip
 
 
@@ -178,9 +189,9 @@ def batches() -> None:
 def memory() -> dict[str, float]:
     case = Case.of(canonical(), ORIGINAL, 9)
     case.milliseconds(2, 1)
-    began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    held = forget_peak()
     case.milliseconds(150, 1)
-    return {"rollout_mb": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - began) / 1024}
+    return {"rollout_mb": peak_mb() - held}
 
 
 def main() -> None:
@@ -192,10 +203,10 @@ def main() -> None:
     torch.set_num_threads(1)
     numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
     if arguments.grow:
-        alone(lambda: grow(arguments.grow))
+        print(json.dumps(grow(arguments.grow)))
         return
     if arguments.memory:
-        alone(memory)
+        print(json.dumps(memory()))
         return
     print(f"yardstick (banded Cholesky, 480 x 480, bandwidth 65, one thread): {yardstick():.3f} ms")
     speed(arguments.folder)
