@@ -15,6 +15,7 @@ Array = NDArray[Any]
 TOLERANCE = 1e-10  # largest nodal residual accepted [N]
 ROUNDING = 8.0 * np.finfo(float).eps  # relative error allowed for in positions
 MAX_ITERATIONS = 200
+PROJECTED = (0.02, 0.1, 0.4, 1.0)  # shares of the projection tried where the exact tangent is indefinite
 
 
 def minimise(
@@ -30,9 +31,9 @@ def minimise(
     """Positions minimising sum inertia/2 |q - target|^2 - force . q + the body's energy.
 
     Each trajectory of the batch goes its own way to a residual of 1e-10 N, or to what rounding of the
-    positions alone makes where that is more. A factor is used again while it contracts well; a new one
-    is made of the exact tangent where the iterate then is, or of its positive semi-definite projection
-    where that is indefinite, and its step is shortened until the energy falls.
+    positions alone makes where that is more. A factor is used again while it contracts well enough to be
+    worth it. A new one is made of the exact tangent where the iterate then is, with as much of its positive
+    semi-definite projection as makes it definite, and its step is shortened until the energy falls.
 
     Args:
         engine: the arithmetic.
@@ -115,6 +116,8 @@ def minimise(
         if len(pending):
             break
     open_ = np.flatnonzero(~(largest <= enough))
+    if not len(open_):
+        return q
     worst = open_[np.argmax(np.where(np.isfinite(largest[open_]), largest[open_], np.inf))]
     raise SimulationError(
         f"{what}: trajectory {worst} did not converge (residual {largest[worst]:.3g} N, "
@@ -135,16 +138,21 @@ def _factor(
     largest: Array,
 ) -> None:  # fmt: skip
     _, _, tangents = engine.terms(q, resistance, tangent=True)
-    definite = engine.factor(factors, rows, tangents, diagonal)
-    left = np.flatnonzero(~definite)
+    left = np.flatnonzero(~engine.factor(factors, rows, tangents, diagonal))
     if not len(left):
         return
-    _, _, tangents = engine.terms(q[left], resistance.rows(left), tangent=True, project=True)
+    # As little of the projection as will do: it is far too stiff in the direction the body buckles.
+    exact = tangents[left]
+    _, _, projected = engine.terms(q[left], resistance.rows(left), tangent=True, project=True)
     shift = 1e-9 * engine.stiffest(resistance.moduli[left])[:, None]
-    definite = engine.factor(factors, rows[left], tangents, diagonal[left] + shift)
-    if not definite.all():
-        worst = left[np.argmin(definite)]
-        raise SimulationError(
-            f"{what}: trajectory {rows[worst]}: the tangent cannot be factored (residual "
-            f"{largest[worst]:.3g} N); hold more nodes or check the material"
-        )
+    for share in PROJECTED:
+        mixed = exact + share * (projected - exact)
+        failed = ~engine.factor(factors, rows[left], mixed, diagonal[left] + shift)
+        if not failed.any():
+            return
+        exact, projected, shift, left = exact[failed], projected[failed], shift[failed], left[failed]
+    worst = left[0]
+    raise SimulationError(
+        f"{what}: trajectory {rows[worst]}: the tangent cannot be factored (residual "
+        f"{largest[worst]:.3g} N); hold more nodes or check the material"
+    )
