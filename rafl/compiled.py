@@ -51,7 +51,7 @@ class Compiled:
         self._volume = np.ascontiguousarray(np.stack(volume, axis=1))
 
     @contextmanager
-    def _threads(self, batch: int) -> Iterator[None]:
+    def threads(self, batch: int) -> Iterator[None]:
         """One thread where little is to be done: two would spend longer waiting than working."""
         before = numba.get_num_threads()
         if batch * len(self.mesh.hexes) < CELLS_FOR_TWO:
@@ -95,28 +95,25 @@ class Compiled:
         energy, gradient = np.empty(batch), np.empty_like(q)
         stiffness = np.empty((batch if tangent else 0, len(self.mesh.hexes), 6, 8, 8))
         none = np.zeros((1, 1, 1, 1))
-        with self._threads(batch):
-            element_terms(
-                q, self.mesh.hexes, self._by_point, self._by_node, self._volume, self.shares, self.law,
-                resistance.moduli, resistance.damped,
-                none[0] if resistance.drift is None else resistance.drift,
-                none if resistance.strain is None else resistance.strain,
-                resistance.rate, resistance.strain_rate, project, tangent, energy, gradient, stiffness,
-            )  # fmt: skip
+        element_terms(
+            q, self.mesh.hexes, self._by_point, self._by_node, self._volume, self.shares, self.law,
+            resistance.moduli, resistance.damped,
+            none[0] if resistance.drift is None else resistance.drift,
+            none if resistance.strain is None else resistance.strain,
+            resistance.rate, resistance.strain_rate, project, tangent, energy, gradient, stiffness,
+        )  # fmt: skip
         return energy, gradient, stiffness
 
     def multiply(self, tangents: Array, x: Array) -> Array:
         """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
         out = np.empty_like(x)
-        with self._threads(len(x)):
-            multiply(tangents, np.arange(len(self.mesh.hexes)), self.mesh.hexes, x, out)
+        multiply(tangents, np.arange(len(self.mesh.hexes)), self.mesh.hexes, x, out)
         return out
 
     def reactions(self, tangents: Array, x: Array) -> Array:
         """Tangent times x (B, N, 3) on the held nodes, (B, F, 3)."""
         out = np.empty_like(x)
-        with self._threads(len(x)):
-            multiply(tangents, self._touching, self.mesh.hexes, x, out)
+        multiply(tangents, self._touching, self.mesh.hexes, x, out)
         return out[:, self.fixed]
 
     @property
@@ -130,13 +127,11 @@ class Compiled:
 
     def factor(self, factors: Factors, rows: Array, tangents: Array, diagonal: Array) -> NDArray[np.bool_]:
         """Factor tangents plus a diagonal (R, n) into `rows`; True where positive definite."""
-        with self._threads(len(rows)):
-            return self.linear.factor(factors, rows, tangents, diagonal)
+        return self.linear.factor(factors, rows, tangents, diagonal)
 
     def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
         """Solutions (R, C, n) of right sides (R, C, n)."""
-        with self._threads(len(rows)):
-            return self.linear.solve(factors, rows, right)
+        return self.linear.solve(factors, rows, right)
 
     def solve_once(self, tangents: Array, diagonal: Array, right: Array) -> Array:
         """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""

@@ -1,5 +1,6 @@
 """What the simulator asks of its arithmetic; `rafl.compiled` and `rafl.plain` both answer."""
 
+from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
 from numpy.typing import NDArray
@@ -46,6 +47,9 @@ class Engine(Protocol):
 
     def reactions(self, tangents: Any, x: Array) -> Array:
         """Tangent times x (B, N, 3) on the held nodes, (B, F, 3)."""
+
+    def threads(self, batch: int) -> AbstractContextManager[None]:
+        """As many threads as a batch of this size is worth."""
 
     def allocate(self, batch: int) -> Factors:
         """Room for the factors of a batch."""

@@ -75,20 +75,21 @@ class Minimum(torch.autograd.Function):
         q = _array(x)
         batch, nodes = q.shape[:2]
         free = engine.free_index
-        tangents = engine.terms(q, resistance, tangent=True)[2]
         weight = _array(inertia)
         diagonal = np.repeat(weight, 3, axis=1)[:, free]
         right = np.ascontiguousarray(_array(grad).reshape(batch, -1)[:, free])
         adjoint = np.zeros((batch, 3 * nodes))
-        adjoint[:, free] = engine.solve_once(tangents, diagonal, right[:, None])[:, 0]
-        adjoint = adjoint.reshape(batch, nodes, 3)
         needs = ctx.needs_input_grad
-        by = torch.from_numpy(adjoint)
         by_held = by_moduli = by_drift = by_strain = None
-        if needs[3]:
-            by_held = torch.from_numpy(grad.numpy()[:, simulator.fixed] - engine.reactions(tangents, adjoint))
-        if needs[4]:
-            by_moduli = torch.from_numpy(_by_moduli(engine, q, resistance, adjoint))
+        with engine.threads(batch):
+            tangents = engine.terms(q, resistance, tangent=True)[2]
+            adjoint[:, free] = engine.solve_once(tangents, diagonal, right[:, None])[:, 0]
+            adjoint = adjoint.reshape(batch, nodes, 3)
+            if needs[3]:
+                by_held = torch.from_numpy(grad.numpy()[:, simulator.fixed] - engine.reactions(tangents, adjoint))
+            if needs[4]:
+                by_moduli = torch.from_numpy(_by_moduli(engine, q, resistance, adjoint))
+        by = torch.from_numpy(adjoint)
         if resistance.damped and (needs[5] or needs[6]):
             by_drift, by_strain = _by_past(engine, q, resistance, adjoint)
         return (

@@ -28,6 +28,7 @@ from rafl.mesh import HexMesh
 
 Array = NDArray[Any]
 
+LITTLE_WORK = 3e8  # multiplications to factor; below it a band wins whatever its levels
 MOST_WORK = 1e11  # multiplications to factor; beyond it multigrid wins
 ITERATIVE_TOLERANCE = 1e-10  # of the right side
 
@@ -461,7 +462,7 @@ def linear_solver(mesh: HexMesh, fixed: NDArray[np.int64]) -> LinearSolver:
     banded, levels = Banded(mesh, fixed), Levels(mesh, fixed)
     if min(banded.work, levels.work) > MOST_WORK:
         return Iterative(mesh, fixed)
-    return banded if banded.work <= levels.work else levels
+    return banded if banded.work <= max(levels.work, LITTLE_WORK) else levels
 
 
 def _solve_by_pivoting(unknowns: Unknowns, stiffness: Array, diagonal: Array, right: Array) -> Array:

@@ -51,48 +51,50 @@ def minimise(
     Raises:
         SimulationError: no convergence; names trajectory, residual and what to try.
     """
-    q = start.copy()
-    batch = len(q)
+    batch, shape = len(start), start.shape[1:]
     free = engine.free_index
     factors = factors or engine.allocate(batch)
     diagonal = np.repeat(inertia, 3, axis=1)[:, free]
+    wanted, load = target.reshape(batch, -1)[:, free], force.reshape(batch, -1)[:, free]
+    q = start.reshape(batch, -1).copy()
 
     def objective(rows: Array, at: Array) -> tuple[Array, Array, Array]:
-        energy, gradient, _ = engine.terms(at, resistance.rows(rows), tangent=False)
-        gap = at - target[rows]
-        pull = inertia[rows][:, :, None] * gap
-        inertial = 0.5 * (pull * gap).sum(axis=(1, 2))
-        work = (force[rows] * at).sum(axis=(1, 2))
-        size = np.abs(energy) + inertial + np.abs(work)
-        return energy + inertial - work, size, (gradient + pull - force[rows]).reshape(len(rows), -1)[:, free]
-
-    def moved(rows: Array, step: Array) -> Array:
-        trial = q[rows].reshape(len(rows), -1)
-        trial[:, free] += step
-        return trial.reshape(len(rows), -1, 3)
+        """Energy, the size of its parts, and the residual (R, n) of positions (R, 3 N)."""
+        whole = len(rows) == batch
+        some = slice(None) if whole else rows
+        resisting = resistance if whole else resistance.rows(rows)
+        elastic, gradient, _ = engine.terms(at.reshape(-1, *shape), resisting, tangent=False)
+        x, pushed = at[:, free], load[some]
+        gap = x - wanted[some]
+        pull = diagonal[some] * gap
+        inertial, work = 0.5 * _dot(pull, gap), _dot(pushed, x)
+        residual = gradient.reshape(len(rows), -1)[:, free] + pull - pushed
+        return elastic + inertial - work, np.abs(elastic) + inertial + np.abs(work), residual
 
     stiffest = engine.stiffest(resistance.moduli)
-    reach = ROUNDING * np.abs(q).max(axis=(1, 2))  # what rounding does to positions [m]
+    reach = ROUNDING * np.abs(q).max(axis=1)  # what rounding does to positions [m]
     energy, _, residual = objective(np.arange(batch), q)
     largest = np.abs(residual).max(axis=1)
     enough = np.maximum(TOLERANCE, stiffest * reach)
     for _ in range(MAX_ITERATIONS):
         running = np.flatnonzero(~(largest <= enough))
         if not len(running):
-            return q
+            return q.reshape(start.shape)
         if not np.isfinite(largest[running]).all():
             break
         stale = factors.ready[running]
         new = running[~stale]
         if len(new):
-            _factor(engine, q[new], resistance.rows(new), factors, new, diagonal[new], what, largest[new])
+            at = q[new].reshape(-1, *shape)
+            _factor(engine, at, resistance.rows(new), factors, new, diagonal[new], what, largest[new])
         step = -engine.solve(factors, running, residual[running][:, None])[:, 0]
-        slope = (step * residual[running]).sum(axis=1)
+        slope = _dot(step, residual[running])
         length = np.ones(len(running))
         pending = np.arange(len(running))
         for _ in range(40):
             rows = running[pending]
-            trial = moved(rows, length[pending, None] * step[pending])
+            trial = q[rows]
+            trial[:, free] += length[pending, None] * step[pending]
             e, parts, r = objective(rows, trial)
             size = np.abs(r).max(axis=1)
             # Close to the minimum energies differ by rounding only: the residual decides there.
@@ -117,12 +119,17 @@ def minimise(
             break
     open_ = np.flatnonzero(~(largest <= enough))
     if not len(open_):
-        return q
+        return q.reshape(start.shape)
     worst = open_[np.argmax(np.where(np.isfinite(largest[open_]), largest[open_], np.inf))]
     raise SimulationError(
         f"{what}: trajectory {worst} did not converge (residual {largest[worst]:.3g} N, "
         f"wanted {enough[worst]:.0e} N); try a smaller time step, more substeps or a smaller load"
     )
+
+
+def _dot(a: Array, b: Array) -> Array:
+    """Row by row, (R)."""
+    return np.einsum("ij,ij->i", a, b)
 
 
 def _worth_keeping(shrinking: Array, left: Array, engine: Engine) -> NDArray[np.bool_]:

@@ -3,6 +3,7 @@
 Nothing here is tuned. Matrices are dense, so it suits specimens of some thousand unknowns.
 """
 
+from contextlib import AbstractContextManager, nullcontext
 from functools import cached_property
 from typing import Any
 
@@ -157,6 +158,10 @@ class Plain:
     def reactions(self, tangents: Tensor, x: Array) -> Array:
         """Tangent times x (B, N, 3) on the held nodes, (B, F, 3)."""
         return self.multiply(tangents, x)[:, self.fixed]
+
+    def threads(self, batch: int) -> AbstractContextManager[None]:
+        """As many threads as torch has."""
+        return nullcontext()
 
     def _reduced(self, tangents: Tensor, diagonal: Array) -> Tensor:
         free = torch.from_numpy(self.free_index).to(self.device)

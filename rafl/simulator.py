@@ -102,7 +102,8 @@ class Simulator:
         factors: Factors | None = None,
     ) -> Array:  # fmt: skip
         """`rafl.newton.minimise` with this specimen's arithmetic."""
-        return minimise(self.engine, start, inertia, target, force, resistance, what, factors)
+        with self.engine.threads(len(start)):
+            return minimise(self.engine, start, inertia, target, force, resistance, what, factors)
 
     def equilibrium(
         self, force: Array, start: Array | None = None, what: str = "equilibrium", resistance: Resistance | None = None
