@@ -7,7 +7,7 @@ Both keep the same promises: `allocate` room for a batch of factors, `factor` so
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any, Protocol
 
 import numba
@@ -28,6 +28,7 @@ from rafl.mesh import HexMesh
 
 Array = NDArray[Any]
 
+UPWARD = 1.15  # how much longer elimination from the far end takes
 LITTLE_WORK = 3e8  # multiplications to factor; below it a band wins whatever its levels
 MOST_WORK = 1e11  # multiplications to factor; beyond it multigrid wins
 ITERATIVE_TOLERANCE = 1e-10  # of the right side
@@ -190,8 +191,8 @@ class _Level:
 class Levels:
     """Cholesky factors of a block-tridiagonal matrix, eliminated from both ends at once.
 
-    The blocks are the level sets of the mesh's graph as seen from the held nodes, so a body with a
-    thin waist costs what its sections cost and not what its thickest does.
+    The blocks are the level sets of the mesh's graph as seen from the held nodes or from an end of its
+    longest side, so a body with a thin waist costs what its sections cost and not what its thickest does.
     """
 
     patience = 7.0
@@ -214,8 +215,8 @@ class Levels:
             place = up.stop
         self._levels = levels
         self._size = place
-        work = np.cumsum([float(s) ** 3 for s in sizes])
-        self._middle = int(np.searchsorted(work, 0.5 * work[-1]))
+        # Both ends' work alike; from below solves with triangles on the left take longer.
+        self._middle = min(range(len(sizes)), key=lambda k: max(_work(sizes[: k + 1]), UPWARD * _work(sizes[k:][::-1])))
 
     @cached_property
     def _destination(self) -> NDArray[np.int64]:
@@ -356,6 +357,8 @@ def _seeds(mesh: HexMesh, free: NDArray[np.int64], fixed: NDArray[np.int64]) -> 
     """Sets of free nodes (as places in `free`) from which levels may be counted."""
     graph = _graph(mesh, free)
     yield np.array([reverse_cuthill_mckee(graph, symmetric_mode=True)[0]])
+    along = mesh.vertices[free, np.argmax(np.ptp(mesh.vertices, axis=0))]
+    yield np.flatnonzero(along < along.min() + 1e-6 * np.ptp(along))
     touching = np.isin(mesh.hexes, fixed).any(axis=1)
     beside = np.flatnonzero(np.isin(free, mesh.hexes[touching]))
     if len(beside):
@@ -385,14 +388,18 @@ def _level_sets(
     return sizes, free[np.argsort(level, kind="stable")]
 
 
+@cache
+def _pool(threads: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(threads)
+
+
 def _together(tasks: list[Callable[[], Any]]) -> list[Any]:
     """Results of tasks that release the interpreter, on as many threads as the kernels use."""
     threads = min(numba.get_num_threads(), len(tasks))
     with _BLAS.limit(limits=1, user_api="blas"):
         if threads <= 1:
             return [task() for task in tasks]
-        with ThreadPoolExecutor(threads) as pool:
-            return list(pool.map(lambda task: task(), tasks))
+        return list(_pool(threads).map(lambda task: task(), tasks))
 
 
 class Iterative:
@@ -462,7 +469,7 @@ def linear_solver(mesh: HexMesh, fixed: NDArray[np.int64]) -> LinearSolver:
     banded, levels = Banded(mesh, fixed), Levels(mesh, fixed)
     if min(banded.work, levels.work) > MOST_WORK:
         return Iterative(mesh, fixed)
-    return banded if banded.work <= max(levels.work, LITTLE_WORK) else levels
+    return banded if banded.work <= max(0.6 * levels.work, LITTLE_WORK) else levels
 
 
 def _solve_by_pivoting(unknowns: Unknowns, stiffness: Array, diagonal: Array, right: Array) -> Array:
