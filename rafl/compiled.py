@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from rafl.elements import element_terms, multiply
 from rafl.laws import LAWS
-from rafl.linear import Factors, LinearSolver, linear_solver
+from rafl.linear import Factors, LinearSolver
 from rafl.mesh import HexMesh, Quadrature
 from rafl.resistance import Resistance
+from rafl.solvers import linear_solver
 
 Array = NDArray[Any]
 

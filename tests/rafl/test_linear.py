@@ -1,8 +1,11 @@
 import numpy as np
 import pytest
 
+from rafl.banded import Banded
 from rafl.compiled import Compiled
-from rafl.linear import Banded, Iterative, Levels, LinearSolver
+from rafl.iterative import Iterative
+from rafl.levels import Levels
+from rafl.linear import LinearSolver
 from rafl.mesh import HexMesh
 from rafl.resistance import Resistance
 

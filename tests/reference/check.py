@@ -9,6 +9,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -160,7 +161,7 @@ def main() -> int:
     for path in paths:
         try:
             found = deviations(path)
-        except (SimulationError, KeyError, ValueError, OSError) as error:
+        except (SimulationError, KeyError, ValueError, OSError, BadZipFile) as error:
             print(f"{path.name:48s} FAILED: {error}")
             failed = True
             continue
