@@ -35,6 +35,9 @@ def test_the_canonical_beam_is_the_papers() -> None:
         ("face: x-min", "face: left", "clamp.face"),
         ("name: La0", "name: Lb0", "twice"),
         ("mass: lumped", "mass: heavy", "material.mass"),
+        ("mass: lumped", "preset: fancy", "material.preset"),
+        ("mass: lumped", "viscosity: -1", "material.viscosity"),
+        ("clamp:", "simulation: {substeps: 0}\nclamp:", "simulation.substeps"),
     ],
 )
 def test_bad_files_name_the_key(specimen_file: Path, old: str, new: str, part: str) -> None:
@@ -43,6 +46,24 @@ def test_bad_files_name_the_key(specimen_file: Path, old: str, new: str, part: s
     specimen_file.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=part):
         read_specimen(specimen_file)
+
+
+@pytest.mark.parametrize(
+    ("said", "law", "mass"),
+    [
+        ("", "corotated", "lumped"),
+        (", preset: paper", "projective", "uniform"),
+        (", preset: paper, mass: lumped", "projective", "lumped"),
+        (", law: neo-hookean", "neo-hookean", "lumped"),
+    ],
+)
+def test_presets_give_way_to_what_is_said(specimen_file: Path, said: str, law: str, mass: str) -> None:
+    text = specimen_file.read_text().replace(", mass: lumped", f"{said}, viscosity: 30")
+    specimen_file.write_text(text.replace("clamp:", "simulation: {integrator: generalised-alpha, substeps: 2}\nclamp:"))
+    specimen = read_specimen(specimen_file)
+    assert (specimen.material.law, specimen.material.mass, specimen.material.viscosity) == (law, mass, 30.0)
+    simulator = specimen.simulator(0.01)
+    assert (simulator.integrator, simulator.substeps) == ("generalised-alpha", 2)
 
 
 def test_a_marker_off_the_skin_is_refused_by_name(specimen_file: Path) -> None:

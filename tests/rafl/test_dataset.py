@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -10,8 +11,12 @@ from rafl.dataset import Dataset, read_dataset, write_dataset
 
 def test_round_trip(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
+    material = replace(dataset.simulator.material, viscosity=12.0, integration="selective")
+    simulator = replace(dataset.simulator, material=material, integrator="generalised-alpha", substeps=3)
+    dataset = replace(dataset, simulator=simulator)
     write_dataset(path, dataset)
     back = read_dataset(path)
+    assert (back.simulator.integrator, back.simulator.substeps) == ("generalised-alpha", 3)
     assert back.name == dataset.name
     assert back.simulator.material == dataset.simulator.material
     assert back.simulator.gravity == dataset.simulator.gravity
