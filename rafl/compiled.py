@@ -18,7 +18,7 @@ from rafl.solvers import linear_solver
 
 Array = NDArray[Any]
 
-CELLS_FOR_TWO = 170  # in a batch, below which one thread is as fast as two
+CELLS_FOR_TWO = 120  # in a batch, below which one thread is as fast as two
 
 
 class Compiled:
