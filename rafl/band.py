@@ -42,15 +42,15 @@ def factor_bands(stiffness, diagonal, entries, destination, rows, bands, length,
     n = diagonal.shape[1]
     for r in prange(len(rows)):
         band = bands[rows[r]]
-        _scatter(stiffness[r], entries, destination, band)
+        band[:] = 0.0
+        _add_entries(stiffness[r], entries, destination, band)
         for c in range(n):
             band[c * length + c % LANES] += diagonal[r, c]
         pivots[r] = _factor(band, n, length)
 
 
 @njit(**KERNEL)
-def _scatter(stiffness, entries, destination, flat):  # type: ignore[no-untyped-def]
-    flat[:] = 0.0
+def _add_entries(stiffness, entries, destination, flat):  # type: ignore[no-untyped-def]
     for m in range(len(entries)):
         flat[destination[m]] += stiffness[entries[m]]
 
@@ -58,8 +58,13 @@ def _scatter(stiffness, entries, destination, flat):  # type: ignore[no-untyped-
 @njit(parallel=True, **KERNEL)
 def scatter(stiffness, entries, destination, rows, flat):  # type: ignore[no-untyped-def]
     """Sum entries (M) of the cells' (R, E * 384) into rows of flat (B, size), at `destination` (M)."""
+    pieces = 16
+    length = flat.shape[1] // pieces + 1
+    for task in prange(len(rows) * pieces):
+        start = (task % pieces) * length
+        flat[rows[task // pieces], start : start + length] = 0.0
     for r in prange(len(rows)):
-        _scatter(stiffness[r], entries, destination, flat[rows[r]])
+        _add_entries(stiffness[r], entries, destination, flat[rows[r]])
 
 
 @njit(**KERNEL)

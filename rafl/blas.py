@@ -48,22 +48,28 @@ def cholesky(a: Array) -> bool:
     return info.value == 0
 
 
-def solve_triangle(lower: Array, b: Array, *, transposed: bool = False, right: bool = False) -> None:
-    """Replace b by L^-1 b, or L^-T b; with `right`, by b L^-1 or b L^-T. lower (n, n), b of fitting shape."""
+def solve_triangle(lower: Array, b: Array, *, transposed: bool = False) -> None:
+    """Replace b (n, m) by L^-1 b, or by L^-T b; lower (n, n)."""
+    _solve(b"L", lower, b, transposed)
+
+
+def solve_transposed_right(lower: Array, b: Array) -> None:
+    """Replace b (m, n) by b L^-T; lower (n, n)."""
+    _solve(b"R", lower, b, transposed=True)
+
+
+def _solve(side: bytes, lower: Array, b: Array, transposed: bool) -> None:
     rows, columns = b.shape
     _trsm(
-        b"R" if right else b"L", b"L", b"T" if transposed else b"N", b"N", _int(rows), _int(columns), _ONE,
+        side, b"L", b"T" if transposed else b"N", b"N", _int(rows), _int(columns), _ONE,
         _at(lower), _int(len(lower)), _at(b), _int(rows),
     )  # fmt: skip
 
 
-def subtract_square(c: Array, a: Array, *, transposed: bool = False) -> None:
-    """Take a a^T, or a^T a, from the lower triangle of c (n, n)."""
-    n, inner = a.shape[::-1] if transposed else a.shape
-    _syrk(
-        b"L", b"T" if transposed else b"N", _int(n), _int(inner), _MINUS_ONE, _at(a), _int(a.shape[0]), _ONE,
-        _at(c), _int(n),
-    )  # fmt: skip
+def subtract_square(c: Array, a: Array) -> None:
+    """Take a a^T from the lower triangle of c (n, n)."""
+    n, inner = a.shape
+    _syrk(b"L", b"N", _int(n), _int(inner), _MINUS_ONE, _at(a), _int(n), _ONE, _at(c), _int(n))
 
 
 def subtract_product(c: Array, a: Array, b: Array, *, transposed: bool = False) -> None:

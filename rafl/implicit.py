@@ -1,7 +1,7 @@
 """Steps and equilibria as differentiable functions, by the implicit-function theorem."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,9 +10,7 @@ from torch import Tensor
 from rafl.engine import Engine
 from rafl.linear import Factors
 from rafl.resistance import MODULI, Resistance
-
-if TYPE_CHECKING:
-    from rafl.simulator import Simulator
+from rafl.simulator import Simulator
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class Setting:
         factors: of the step before.
     """
 
-    simulator: "Simulator"
+    simulator: Simulator
     guess: Tensor | None
     rate: float = 1.0
     strain_rate: float = 1.0

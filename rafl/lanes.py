@@ -66,16 +66,25 @@ def _three_arrays(build: Any) -> Any:
     return function
 
 
-def weighted_rows(count: int, weight_stride: int, row_stride: int, *, add: bool = False) -> Any:
-    """Compiled (out, o, weights, i, rows, j): out[o:o+8] (+)= sum_m weights[i + m ws] rows[j + m rs: +8]."""
-
-    def build(builder: Any, out: _Rows, weights: _Rows, rows: _Rows) -> None:
+def _sum_of_products(count: int, a_stride: int, b_stride: int, *, spread: bool, add: bool) -> Any:
+    def build(builder: Any, out: _Rows, a: _Rows, b: _Rows) -> None:
         total = out.load(0) if add else None
         for m in range(count):
-            total = _add_product(builder, total, weights.spread(m * weight_stride), rows.load(m * row_stride))
+            factor = (a.spread if spread else a.load)(m * a_stride)
+            total = _add_product(builder, total, factor, b.load(m * b_stride))
         out.store(total, 0)
 
     return _three_arrays(build)
+
+
+def weighted_rows(count: int, weight_stride: int, row_stride: int, *, add: bool = False) -> Any:
+    """Compiled (out, o, weights, i, rows, j): out[o:o+8] (+)= sum_m weights[i + m ws] rows[j + m rs: +8]."""
+    return _sum_of_products(count, weight_stride, row_stride, spread=True, add=add)
+
+
+def lane_products(count: int, a_stride: int, b_stride: int) -> Any:
+    """Compiled (out, o, a, i, b, j): out[o:o+8] = sum_m a[i + m as: +8] b[j + m bs: +8], lane by lane."""
+    return _sum_of_products(count, a_stride, b_stride, spread=False, add=False)
 
 
 def add_rows(count: int) -> Any:
@@ -106,18 +115,6 @@ def add_rows(count: int) -> Any:
         return types.void(out, types.intp, weights, types.intp, rows, types.intp, types.intp, types.intp), codegen
 
     return function
-
-
-def lane_products(count: int, a_stride: int, b_stride: int, *, add: bool = False) -> Any:
-    """Compiled (out, o, a, i, b, j): out[o:o+8] (+)= sum_m a[i + m as: +8] b[j + m bs: +8], lane by lane."""
-
-    def build(builder: Any, out: _Rows, a: _Rows, b: _Rows) -> None:
-        total = out.load(0) if add else None
-        for m in range(count):
-            total = _add_product(builder, total, a.load(m * a_stride), b.load(m * b_stride))
-        out.store(total, 0)
-
-    return _three_arrays(build)
 
 
 def transposed_product(count: int) -> Any:

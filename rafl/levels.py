@@ -19,18 +19,17 @@ from rafl.mesh import HexMesh
 
 Array = NDArray[Any]
 
-UPWARD = 1.15  # how much longer elimination from the far end takes
-
 _BLAS = ThreadpoolController()
 
 
 @dataclass(frozen=True)
 class _Level:
-    """Where one level's blocks stand in the flat storage."""
+    """Where one level's blocks stand in the flat storage, column after column."""
 
     unknowns: slice
-    own: slice  # diagonal block, (size, size), column after column
-    up: slice  # coupling to the next level, (size of next, size)
+    inward: int  # the next level towards the middle; of the middle itself, its own number
+    own: slice  # diagonal block, (size, size)
+    coupling: slice  # to the next level inward, (size of that, size); the middle has none
 
 
 class Levels:
@@ -50,143 +49,112 @@ class Levels:
         self.unknowns = Unknowns(mesh, order)
         self.free_index = self.unknowns.free_index
         self.work = _work(sizes)
-        ends = np.cumsum(sizes)
-        levels, place = [], 0
+        middle = min(range(len(sizes)), key=lambda k: max(_work(sizes[: k + 1]), _work(sizes[k:][::-1])))
+        self._middle = middle
+        self._sides = (range(middle), range(len(sizes) - 1, middle, -1))  # outermost level first
+        ends, place = np.cumsum(sizes), 0
+        self._levels: list[_Level] = []
         for k, size in enumerate(sizes):
-            after = sizes[k + 1] if k + 1 < len(sizes) else 0
+            inward = k + (k < middle) - (k > middle)
             own = slice(place, place + size * size)
-            up = slice(own.stop, own.stop + size * after)
-            levels.append(_Level(slice(ends[k] - size, ends[k]), own, up))
-            place = up.stop
-        self._levels = levels
+            coupling = slice(own.stop, own.stop + (size * sizes[inward] if k != middle else 0))
+            self._levels.append(_Level(slice(ends[k] - size, ends[k]), inward, own, coupling))
+            place = coupling.stop
         self._size = place
-        # Both ends' work alike; from below solves with triangles on the left take longer.
-        self._middle = min(range(len(sizes)), key=lambda k: max(_work(sizes[: k + 1]), UPWARD * _work(sizes[k:][::-1])))
 
     @cached_property
     def _destination(self) -> NDArray[np.int64]:
         rows, columns = self.unknowns.rows, self.unknowns.columns
-        level_of = np.repeat(np.arange(len(self._levels)), [_length(level) for level in self._levels])
         start = np.array([level.unknowns.start for level in self._levels])
         length = np.array([_length(level) for level in self._levels])
         own = np.array([level.own.start for level in self._levels])
-        up = np.array([level.up.start for level in self._levels])
+        coupling = np.array([level.coupling.start for level in self._levels])
+        level_of = np.repeat(np.arange(len(length)), length)
         low, high = level_of[columns], level_of[rows]
         inside = own[low] + (columns - start[low]) * length[low] + rows - start[low]
-        across = up[low] + (columns - start[low]) * length[high] + rows - start[high]
-        return np.where(low == high, inside, across)
+        from_below = coupling[low] + (columns - start[low]) * length[high] + rows - start[high]
+        from_above = coupling[high] + (rows - start[high]) * length[low] + columns - start[low]
+        return np.where(low == high, inside, np.where(low < self._middle, from_below, from_above))
 
     def allocate(self, batch: int) -> Factors:
         """Room for the factors of a batch."""
         return Factors(np.zeros((batch, self._size)), np.zeros(batch, dtype=bool))
 
     def _blocks(self, flat: Array) -> tuple[list[Array], list[Array]]:
-        sizes = [_length(level) for level in self._levels]
-        own = [flat[level.own].reshape(s, s, order="F") for level, s in zip(self._levels, sizes, strict=True)]
-        up = [
-            flat[level.up].reshape(after, s, order="F")
-            for level, s, after in zip(self._levels, sizes, [*sizes[1:], 0], strict=True)
-        ]
-        return own, up
+        """Diagonal blocks and couplings, by level."""
+        own, couplings = [], []
+        for level in self._levels:
+            size, inward = _length(level), _length(self._levels[level.inward])
+            own.append(flat[level.own].reshape(size, size, order="F"))
+            couplings.append(flat[level.coupling].reshape(inward, -1, order="F"))
+        return own, couplings
 
     def factor(self, factors: Factors, rows: Array, stiffness: Array, diagonal: Array) -> NDArray[np.bool_]:
         """Factor `rows` of the batch; True where the matrix was positive definite."""
         scatter(stiffness.reshape(len(rows), -1), self.unknowns.entries, self._destination, rows, factors.storage)
-        last, middle = len(self._levels) - 1, self._middle
-
-        def prepare(row: int) -> tuple[list[Array], list[Array]]:
-            own, up = self._blocks(factors.storage[rows[row]])
+        blocks = [self._blocks(factors.storage[row]) for row in rows]
+        for row, (own, _) in enumerate(blocks):
             for block, level in zip(own, self._levels, strict=True):
                 block[np.diag_indices(len(block))] += diagonal[row, level.unknowns]
-            return own, up
 
-        blocks = [prepare(row) for row in range(len(rows))]
-
-        def downward(row: int) -> bool:
-            own, up = blocks[row]
-            for k in range(middle):
+        def eliminate(row: int, side: range) -> bool:
+            own, couplings = blocks[row]
+            for k in side:
                 if not blas.cholesky(own[k]):
                     return False
-                blas.solve_triangle(own[k], up[k], transposed=True, right=True)
-                if k + 1 < middle:
-                    blas.subtract_square(own[k + 1], up[k])
-            return True
-
-        def upward(row: int) -> bool:
-            own, up = blocks[row]
-            for k in range(last, middle, -1):
-                if not blas.cholesky(own[k]):
-                    return False
-                blas.solve_triangle(own[k], up[k - 1])
-                if k - 1 > middle:
-                    blas.subtract_square(own[k - 1], up[k - 1], transposed=True)
+                blas.solve_transposed_right(own[k], couplings[k])
+                if k != side[-1]:
+                    blas.subtract_square(own[self._levels[k].inward], couplings[k])
             return True
 
         def meet(row: int) -> bool:
-            if not (sides[2 * row] and sides[2 * row + 1]):
-                return False
-            own, up = blocks[row]
-            if middle > 0:
-                blas.subtract_square(own[middle], up[middle - 1])
-            if middle < last:
-                blas.subtract_square(own[middle], up[middle], transposed=True)
-            return blas.cholesky(own[middle])
+            own, couplings = blocks[row]
+            for side in filter(len, self._sides):
+                blas.subtract_square(own[self._middle], couplings[side[-1]])
+            return blas.cholesky(own[self._middle])
 
-        every = range(len(rows))
-        sides = _together([partial(side, r) for r in every for side in (downward, upward)])
-        met = _together([partial(meet, r) for r in every])
-        factors.ready[rows] = met
-        return np.array(met)
+        eliminated = _together([partial(eliminate, row, side) for row in range(len(rows)) for side in self._sides])
+        both = [eliminated[2 * row] and eliminated[2 * row + 1] for row in range(len(rows))]
+        whole = [row for row, done in enumerate(both) if done]
+        definite = np.zeros(len(rows), dtype=bool)
+        definite[whole] = _together([partial(meet, row) for row in whole])
+        factors.ready[rows] = definite
+        return definite
 
     def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
         """Solutions (R, C, n) of right sides (R, C, n)."""
-        last, middle = len(self._levels) - 1, self._middle
-
         blocks = [self._blocks(factors.storage[row]) for row in rows]
-        parts = [
-            [np.asfortranarray(right[row, :, level.unknowns].T) for level in self._levels] for row in range(len(rows))
-        ]
+        parts = [[np.asfortranarray(load[:, level.unknowns].T) for level in self._levels] for load in right]
 
-        def inward(row: int, side: range, step: int) -> None:
-            """Forward substitution from an end up to, not into, the middle."""
-            (own, up), x = blocks[row], parts[row]
+        def inward(row: int, side: range) -> None:
+            (own, couplings), x = blocks[row], parts[row]
             for k in side:
                 blas.solve_triangle(own[k], x[k])
-                if k + step != middle:
-                    _take(x[k + step], up[min(k, k + step)], x[k], step)
+                if k != side[-1]:
+                    blas.subtract_product(x[self._levels[k].inward], couplings[k], x[k])
 
         def meet(row: int) -> None:
-            (own, up), x = blocks[row], parts[row]
-            if middle > 0:
-                _take(x[middle], up[middle - 1], x[middle - 1], 1)
-            if middle < last:
-                _take(x[middle], up[middle], x[middle + 1], -1)
-            blas.solve_triangle(own[middle], x[middle])
-            blas.solve_triangle(own[middle], x[middle], transposed=True)
+            (own, couplings), x = blocks[row], parts[row]
+            for side in filter(len, self._sides):
+                blas.subtract_product(x[self._middle], couplings[side[-1]], x[side[-1]])
+            blas.solve_triangle(own[self._middle], x[self._middle])
+            blas.solve_triangle(own[self._middle], x[self._middle], transposed=True)
 
-        def outward(row: int, side: range, step: int) -> None:
-            """Back substitution from the middle to an end."""
-            (own, up), x = blocks[row], parts[row]
-            for k in side:
-                _take(x[k], up[min(k, k - step)], x[k - step], step)
+        def outward(row: int, side: range) -> None:
+            (own, couplings), x = blocks[row], parts[row]
+            for k in reversed(side):
+                blas.subtract_product(x[k], couplings[k], x[self._levels[k].inward], transposed=True)
                 blas.solve_triangle(own[k], x[k], transposed=True)
 
         every = range(len(rows))
-        inner = ((range(middle), 1), (range(last, middle, -1), -1))
-        outer = ((range(middle - 1, -1, -1), -1), (range(middle + 1, last + 1), 1))
-        _together([partial(inward, r, *side) for r in every for side in inner])
-        _together([partial(meet, r) for r in every])
-        _together([partial(outward, r, *side) for r in every for side in outer])
+        _together([partial(inward, row, side) for row in every for side in self._sides])
+        _together([partial(meet, row) for row in every])
+        _together([partial(outward, row, side) for row in every for side in self._sides])
         return np.stack([np.concatenate(x).T for x in parts])
 
     def solve_indefinite(self, stiffness: Array, diagonal: Array, right: Array) -> Array:
         """Solutions (C, n) of one trajectory's system that no Cholesky factor exists for."""
         return solve_by_pivoting(self.unknowns, stiffness, diagonal, right)
-
-
-def _take(x: Array, up: Array, y: Array, step: int) -> None:
-    """Subtract the coupling of two levels times y from x, the level above where step is 1, below where -1."""
-    blas.subtract_product(x, up, y, transposed=step < 0)
 
 
 def _length(level: _Level) -> int:

@@ -127,7 +127,9 @@ def load_model(run: Path) -> FittedModel:
     """
     content = load_tensors(run / "model.pt", "a fitted model (written by rafl-fit)")
     if content["method"] == "sysid":
-        return FittedModel("sysid", material=dict(content["material"]))
+        if not isinstance(content["material"], dict):
+            raise InputError(f"expected identified values by name in {run / 'model.pt'}, found a list; fit again")
+        return FittedModel("sysid", material=content["material"])
     field = ResidualField()
     field.load_state_dict(content["field"])
     return FittedModel("rafl", field=field)

@@ -59,6 +59,8 @@ class Simulator:
         for key, known in (("integrator", tuple(INTEGRATORS)), ("arithmetic", ARITHMETIC)):
             if getattr(self, key) not in known:
                 raise ValueError(f"expected {key} to be one of {', '.join(known)}, got {getattr(self, key)!r}")
+        if self.device != "cpu" and self.arithmetic != "plain":
+            raise ValueError(f"expected arithmetic to be plain on device {self.device!r}, got {self.arithmetic!r}")
         if not (self.time_step > 0 and self.substeps >= 1):
             raise ValueError(f"expected time_step > 0 and substeps >= 1, got {self.time_step} and {self.substeps}")
 

@@ -119,6 +119,7 @@ def test_failure_names_the_trajectory_and_the_residual() -> None:
         ({"integrator": "leapfrog"}, "integrator to be one of implicit-euler, generalised-alpha"),
         ({"arithmetic": "gpu"}, "arithmetic to be one of compiled, plain"),
         ({"substeps": 0}, "substeps >= 1"),
+        ({"device": "cuda"}, "arithmetic to be plain on device 'cuda'"),
     ],
 )
 def test_unknown_settings_are_refused(keywords: dict[str, object], expected: str) -> None:
