@@ -10,9 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.elements import element_terms, multiply
+from rafl.integration import Integration
 from rafl.laws import LAWS
 from rafl.linear import Factors, LinearSolver
-from rafl.mesh import HexMesh, Quadrature
+from rafl.mesh import HexMesh
 from rafl.resistance import Resistance
 from rafl.solvers import linear_solver
 
@@ -27,7 +28,7 @@ class Compiled:
     Args:
         mesh: the rest shape.
         law: name of the elastic law.
-        integration: `full`, or `selective`: lambda's part at each cell's centre only.
+        integration: `full`, or `selective`: lambda's part of each cell's mean strain only (B-bar).
         fixed: held nodes, (F).
     """
 
@@ -36,20 +37,13 @@ class Compiled:
         self.fixed = fixed
         self._room: Factors | None = None  # of `solve_once`, which is called again and again
         self.law = list(LAWS).index(law)
-        rule = mesh.quadrature
-        gradient, volume = [rule.gradient], [rule.volume]
-        self.shares = np.ones((1, 2))
-        if integration == "selective":
-            mean = mesh.mean
-            gradient.append(np.repeat(mean.gradient, 8, axis=1))
-            volume.append(np.pad(mean.volume, ((0, 0), (0, 7))))
-            self.shares = np.array([[1.0, 0.0], [0.0, 1.0]])
-        groups, cells = len(volume), len(mesh.hexes)
-        points = np.stack(gradient, axis=1)  # (E, G, 8 points, 8 nodes, 3)
+        self.integration = Integration.of(mesh, integration)
+        cells, groups = len(mesh.hexes), len(self.integration.shares)
+        points = self.integration.points.gradient.reshape(cells, groups, 8, 8, 3)  # by group, point and node
         self._by_point = np.ascontiguousarray(points.transpose(0, 1, 3, 4, 2)).reshape(cells, groups, 192)
         self._by_node = np.ascontiguousarray(points.transpose(0, 1, 2, 4, 3)).reshape(cells, groups, 192)
+        self._volume = self.integration.points.volume.reshape(cells, groups, 8)
         self._touching = np.flatnonzero(np.isin(mesh.hexes, fixed).any(axis=1))
-        self._volume = np.ascontiguousarray(np.stack(volume, axis=1))
 
     @contextmanager
     def threads(self, batch: int) -> Iterator[None]:
@@ -61,18 +55,6 @@ class Compiled:
             yield
         finally:
             numba.set_num_threads(before)
-
-    @cached_property
-    def points(self) -> Quadrature:
-        """Every integration point, those of no weight included, as `strain` counts them."""
-        cells = len(self.mesh.hexes)
-        gradient = self._by_node.reshape(cells, -1, 3, 8).transpose(0, 1, 3, 2)
-        return Quadrature(self.mesh.quadrature.shape, gradient, self._volume.reshape(cells, -1))
-
-    @cached_property
-    def point_shares(self) -> Array:
-        """How much of mu and of lambda each integration point carries, (P, 2)."""
-        return np.repeat(self.shares, 8, axis=0)
 
     @cached_property
     def linear(self) -> LinearSolver:
@@ -97,7 +79,7 @@ class Compiled:
         stiffness = np.empty((batch if tangent else 0, len(self.mesh.hexes), 6, 8, 8))
         none = np.zeros((1, 1, 1, 1))
         element_terms(
-            q, self.mesh.hexes, self._by_point, self._by_node, self._volume, self.shares, self.law,
+            q, self.mesh.hexes, self._by_point, self._by_node, self._volume, self.integration.shares, self.law,
             resistance.moduli, resistance.damped,
             none[0] if resistance.drift is None else resistance.drift,
             none if resistance.strain is None else resistance.strain,
@@ -147,11 +129,3 @@ class Compiled:
         for t in np.flatnonzero(~definite):
             solution[t] = self.linear.solve_indefinite(tangents[t], diagonal[t], right[t])
         return solution
-
-    @cached_property
-    def _stiffness_per_modulus(self) -> float:
-        return float(np.einsum("egni,eg->en", self.points.gradient**2, self.points.volume).max())
-
-    def stiffest(self, moduli: Array) -> Array:
-        """A bound on the tangents' diagonal at rest [N/m], (B)."""
-        return (2.0 * moduli[:, 0] + moduli[:, 1]) * self._stiffness_per_modulus

@@ -5,8 +5,9 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
+from rafl.integration import Integration
 from rafl.linear import Factors
-from rafl.mesh import HexMesh, Quadrature
+from rafl.mesh import HexMesh
 from rafl.resistance import Resistance
 
 Array = NDArray[Any]
@@ -16,6 +17,7 @@ class Engine(Protocol):
     """Energy, gradient, tangent and linear solves of one mesh under one law, for batches."""
 
     mesh: HexMesh
+    integration: Integration
 
     @property
     def free_index(self) -> Array:
@@ -24,14 +26,6 @@ class Engine(Protocol):
     @property
     def patience(self) -> float:
         """How many steps with an old factor cost as much as a new one."""
-
-    @property
-    def points(self) -> Quadrature:
-        """Every integration point, those of no weight included."""
-
-    @property
-    def point_shares(self) -> Array:
-        """How much of mu and of lambda each integration point carries, (P, 2)."""
 
     def terms(
         self, q: Array, resistance: Resistance, *, tangent: bool, project: bool = False
@@ -62,6 +56,3 @@ class Engine(Protocol):
 
     def solve_once(self, tangents: Any, diagonal: Array, right: Array) -> Array:
         """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""
-
-    def stiffest(self, moduli: Array) -> Array:
-        """A bound on the tangents' diagonal at rest [N/m], (B)."""

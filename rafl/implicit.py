@@ -147,10 +147,8 @@ def _by_moduli(engine: Engine, q: np.ndarray, resistance: Resistance, adjoint: n
 
 def _by_past(engine: Engine, q: np.ndarray, resistance: Resistance, adjoint: np.ndarray) -> tuple[Tensor, Tensor]:
     """Derivatives by drift and by strain of minus adjoint . internal force."""
-    rule, hexes = engine.points, engine.mesh.hexes
-    eta, mu, lam = (
-        resistance.moduli[:, k, None, None] * engine.point_shares[:, share] for k, share in ((2, 0), (3, 0), (4, 1))
-    )
+    rule, shares, hexes = engine.integration.points, engine.integration.point_shares, engine.mesh.hexes
+    eta, mu, lam = (resistance.moduli[:, k, None, None] * shares[:, share] for k, share in ((2, 0), (3, 0), (4, 1)))
     slope = np.einsum("beni,epnj->bepij", adjoint[:, hexes], rule.gradient)
     trace = np.trace(slope, axis1=-2, axis2=-1)
     stress = mu[..., None, None] * (slope + slope.swapaxes(-1, -2)) + (lam * trace)[..., None, None] * np.eye(3)

@@ -138,3 +138,11 @@ class HexMesh:
         along = self.vertices[:, axis]
         end = along.min() if face.endswith("min") else along.max()
         return np.flatnonzero(np.abs(along - end) < 1e-6 * np.ptp(along))
+
+    def face_quads(self, face: str) -> NDArray[np.int64]:
+        """Boundary quads (S, 4) that lie in the bounding-box face `x-min` ... `z-max`.
+
+        Raises:
+            ValueError: no such face.
+        """
+        return self.surface[np.isin(self.surface, self.face_nodes(face)).all(axis=1)]

@@ -71,7 +71,7 @@ def minimise(
         residual = gradient.reshape(len(rows), -1)[:, free] + pull - pushed
         return elastic + inertial - work, np.abs(elastic) + inertial + np.abs(work), residual
 
-    stiffest = engine.stiffest(resistance.moduli)
+    stiffest = engine.integration.stiffest(resistance.moduli)
     reach = ROUNDING * np.abs(q).max(axis=1)  # what rounding does to positions [m]
     energy, _, residual = objective(np.arange(batch), q)
     largest = np.abs(residual).max(axis=1)
@@ -151,7 +151,7 @@ def _factor(
     # As little of the projection as will do: it is far too stiff in the direction the body buckles.
     exact = tangents[left]
     _, _, projected = engine.terms(q[left], resistance.rows(left), tangent=True, project=True)
-    shift = 1e-9 * engine.stiffest(resistance.moduli[left])[:, None]
+    shift = 1e-9 * engine.integration.stiffest(resistance.moduli[left])[:, None]
     for share in PROJECTED:
         mixed = exact + share * (projected - exact)
         failed = ~engine.factor(factors, rows[left], mixed, diagonal[left] + shift)

@@ -4,7 +4,6 @@ Nothing here is tuned. Matrices are dense, so it suits specimens of some thousan
 """
 
 from contextlib import AbstractContextManager, nullcontext
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,9 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rafl.integration import Integration
 from rafl.laws import LAWS
 from rafl.linear import Factors
-from rafl.mesh import HexMesh, Quadrature
+from rafl.mesh import HexMesh
 from rafl.resistance import Resistance
 
 Array = NDArray[Any]
@@ -44,16 +44,10 @@ class Plain:
         self.fixed = fixed
         self.law = LAWS[law]
         self.device = torch.device(device)
-        rule = mesh.quadrature
-        gradient, volume = rule.gradient, rule.volume
-        shares = np.ones((8, 2))
-        if integration == "selective":
-            gradient = np.concatenate([gradient, np.repeat(mesh.mean.gradient, 8, axis=1)], axis=1)
-            volume = np.concatenate([volume, np.pad(mesh.mean.volume, ((0, 0), (0, 7)))], axis=1)
-            shares = np.repeat([[1.0, 0.0], [0.0, 1.0]], 8, axis=0)
-        self.points = Quadrature(rule.shape, gradient, volume)
-        self.point_shares = shares
-        self._gradient, self._volume, self._shares = (self._tensor(x) for x in (gradient, volume, shares))
+        self.integration = Integration.of(mesh, integration)
+        points = self.integration.points
+        self._gradient, self._volume = self._tensor(points.gradient), self._tensor(points.volume)
+        self._shares = self._tensor(self.integration.point_shares)
         self._hexes = torch.from_numpy(mesh.hexes).to(self.device)
         free = np.setdiff1d(np.arange(len(mesh.vertices)), fixed)
         self.free_index = (3 * free[:, None] + np.arange(3)).ravel()
@@ -188,11 +182,3 @@ class Plain:
     def solve_once(self, tangents: Tensor, diagonal: Array, right: Array) -> Array:
         """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""
         return torch.linalg.solve(self._reduced(tangents, diagonal), self._tensor(right).mT).mT.cpu().numpy()
-
-    @cached_property
-    def _stiffness_per_modulus(self) -> float:
-        return float(np.einsum("epni,ep->en", self.points.gradient**2, self.points.volume).max())
-
-    def stiffest(self, moduli: Array) -> Array:
-        """A bound on the tangents' diagonal at rest [N/m], (B)."""
-        return (2.0 * moduli[:, 0] + moduli[:, 1]) * self._stiffness_per_modulus

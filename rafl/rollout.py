@@ -60,7 +60,7 @@ class _Body:
         return problem.drift, problem.strain_rate * strain + problem.strain_memory * change
 
     def _strains(self, state: State) -> tuple[Tensor, Tensor]:
-        mesh, points = self.simulator.mesh, self.simulator.engine.points
+        mesh, points = self.simulator.mesh, self.simulator.engine.integration.points
         return green_strain(state.q, state.v, torch.from_numpy(mesh.hexes), torch.from_numpy(points.gradient))
 
     def acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:

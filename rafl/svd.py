@@ -60,10 +60,11 @@ def signed_svd(F, U, s, V):  # type: ignore[no-untyped-def]
                 V[i, r] = -x
     for i in range(3):
         B[i, 0] /= s[0]
-    if s[1] > 0.0:
+    along = B[0, 0] * B[0, 1] + B[1, 0] * B[1, 1] + B[2, 0] * B[2, 1]
+    if s[1] > 0.0 and abs(along) < 1e-8 * s[1]:
         for i in range(3):
             B[i, 1] /= s[1]
-    else:  # rank one: any direction across the first serves
+    else:  # rank one, the second column nought or rounding: any direction across the first serves
         k = 0
         for i in range(3):
             if abs(B[i, 0]) < abs(B[k, 0]):

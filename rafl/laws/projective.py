@@ -134,6 +134,12 @@ def volume_projection(s, p):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
+def _projected(stretch, kappa):  # type: ignore[no-untyped-def]
+    """The larger root p of p (p - stretch) = -kappa."""
+    return 0.5 * (stretch + np.sqrt(stretch * stretch - 4.0 * kappa))
+
+
+@njit(**KERNEL)
 def derivatives(w, mu, lam):  # type: ignore[no-untyped-def]
     """Energy density and its derivatives at the scratch's stretches; see `rafl.scratch`.
 
@@ -153,9 +159,9 @@ def derivatives(w, mu, lam):  # type: ignore[no-untyped-def]
             s1 = w[(STRETCH + 1) * 8 + g]
             s2 = w[(STRETCH + 2) * 8 + g]
             kappa = w[TEMPORARY * 8 + g]
-            p0 = 0.5 * (s0 + np.sqrt(s0 * s0 - 4.0 * kappa))
-            p1 = 0.5 * (s1 + np.sqrt(s1 * s1 - 4.0 * kappa))
-            p2 = 0.5 * (s2 + np.sqrt(s2 * s2 - 4.0 * kappa))
+            p0 = _projected(s0, kappa)
+            p1 = _projected(s1, kappa)
+            p2 = _projected(s2, kappa)
             volume = p0 * p1 * p2
             a = p0 * p0 - kappa
             b = p1 * p1 - kappa
@@ -174,9 +180,9 @@ def derivatives(w, mu, lam):  # type: ignore[no-untyped-def]
         s1 = w[(STRETCH + 1) * 8 + g]
         s2 = w[(STRETCH + 2) * 8 + g]
         kappa = w[TEMPORARY * 8 + g]
-        p0 = 0.5 * (s0 + np.sqrt(s0 * s0 - 4.0 * kappa))
-        p1 = 0.5 * (s1 + np.sqrt(s1 * s1 - 4.0 * kappa))
-        p2 = 0.5 * (s2 + np.sqrt(s2 * s2 - 4.0 * kappa))
+        p0 = _projected(s0, kappa)
+        p1 = _projected(s1, kappa)
+        p2 = _projected(s2, kappa)
         w[(TEMPORARY + 1) * 8 + g] = abs(p0 * p1 * p2 - 1.0)
         gap0 = kappa / p0
         gap1 = kappa / p1

@@ -43,7 +43,7 @@ def test_energy_gradient_and_tangent(law: str, integration: str, damped: bool, r
     resistance = Resistance(moduli)
     if damped:
         moduli[:, 2:] = [20.0, 300.0, 900.0]
-        points = compiled.points.volume.shape
+        points = compiled.integration.points.volume.shape
         strain = random.normal(0, 1.0, (len(q), *points, 6))
         resistance = Resistance(moduli, random.normal(0, 0.3, q.shape), 100.0, strain, 120.0)
     x = random.normal(size=q.shape)
@@ -63,7 +63,7 @@ def test_gradient_is_the_slope_of_the_energy_and_tangent_that_of_the_gradient(ra
     for law, integration in product(LAWS, ("full", "selective")):
         engine = Compiled(MESH, law, integration, FIXED)
         q = states(random)[1:3]
-        points = engine.points.volume.shape
+        points = engine.integration.points.volume.shape
         past = (random.normal(0, 0.3, q.shape), 100.0, random.normal(0, 1.0, (2, *points, 6)), 120.0)
         resistance = Resistance(np.tile([7e4, 6e5, 20.0, 300.0, 900.0], (2, 1)), *past)
         direction = random.normal(size=q.shape)
