@@ -2,13 +2,13 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import Field, field_validator
+from pydantic import AfterValidator, Field, field_validator
 
-from calibration.camera import OrthographicCamera, Plane
+from calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane
 from groundwork import StrictModel, read_yaml, write_text
 
 FORMAT = "rafl-calibration/1"
@@ -19,7 +19,13 @@ PLANE_SIGMA_MM = 0.5
 class Rig:
     """Cameras by name, in one world frame."""
 
-    cameras: dict[str, OrthographicCamera]
+    cameras: dict[str, Camera]
+
+
+def _positive(value: tuple[float, float]) -> tuple[float, float]:
+    if min(value) <= 0:
+        raise ValueError("expected two positive numbers")
+    return value
 
 
 class _PlaneEntry(StrictModel):
@@ -35,22 +41,17 @@ class _PlaneEntry(StrictModel):
         return normal
 
 
-class _CameraEntry(StrictModel):
-    model: Literal["orthographic"]
+class _Entry(StrictModel):
     image_size: tuple[int, int]
-    pixels_per_mm: tuple[float, float]
-    skew: float = 0.0
     rotation_vector: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    offset_px: tuple[float, float]
-    distortion: tuple[float, float] = (0.0, 0.0)
     plane: _PlaneEntry | None = None
     time_offset_s: float = 0.0
     residual_px: float = Field(0.0, ge=0)
     covariance: list[list[float]] | None = None
 
-    @field_validator("image_size", "pixels_per_mm")
+    @field_validator("image_size")
     @classmethod
-    def _positive(cls, value: tuple[float, float]) -> tuple[float, float]:
+    def _pixels(cls, value: tuple[int, int]) -> tuple[int, int]:
         if min(value) <= 0:
             raise ValueError("expected two positive numbers")
         return value
@@ -58,9 +59,64 @@ class _CameraEntry(StrictModel):
     @field_validator("covariance")
     @classmethod
     def _square(cls, value: list[list[float]] | None) -> list[list[float]] | None:
-        if value is not None and np.shape(value) != (10, 10):
+        if value is not None and [len(row) for row in value] != [10] * 10:
             raise ValueError("expected 10 rows of 10 numbers")
         return value
+
+    def shared(self) -> dict[str, Any]:
+        """What both models have."""
+        plane = None
+        if self.plane is not None:
+            plane = Plane(self.plane.normal, 1e-3 * self.plane.offset_mm, 1e-3 * self.plane.sigma_mm)
+        return {
+            "image_size": self.image_size,
+            "rotation_vector": self.rotation_vector,
+            "plane": plane,
+            "time_offset": self.time_offset_s,
+            "residual": self.residual_px,
+            "covariance": None if self.covariance is None else tuple(map(tuple, self.covariance)),
+        }
+
+
+class _OrthographicEntry(_Entry):
+    model: Literal["orthographic"]
+    pixels_per_mm: Annotated[tuple[float, float], AfterValidator(_positive)]
+    skew: float = 0.0
+    offset_px: tuple[float, float]
+    distortion: tuple[float, float] = (0.0, 0.0)
+
+    def camera(self) -> Camera:
+        """In metres."""
+        mx, my = self.pixels_per_mm
+        return OrthographicCamera(
+            scale=(1e3 * mx, 1e3 * my),
+            skew=1e3 * self.skew,
+            offset=self.offset_px,
+            distortion=self.distortion,
+            **self.shared(),
+        )
+
+
+class _PinholeEntry(_Entry):
+    model: Literal["pinhole"]
+    focal_px: Annotated[tuple[float, float], AfterValidator(_positive)]
+    centre_px: tuple[float, float]
+    translation_mm: tuple[float, float, float]
+    distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def camera(self) -> Camera:
+        """In metres."""
+        x, y, z = self.translation_mm
+        return PinholeCamera(
+            focal=self.focal_px,
+            centre=self.centre_px,
+            translation=(1e-3 * x, 1e-3 * y, 1e-3 * z),
+            distortion=self.distortion,
+            **self.shared(),
+        )
+
+
+_CameraEntry = Annotated[_OrthographicEntry | _PinholeEntry, Field(discriminator="model")]
 
 
 class _RigFile(StrictModel):
@@ -75,28 +131,7 @@ def read_rig(path: Path) -> Rig:
         InputError: missing, damaged, or of a newer version.
     """
     content = read_yaml(path, _RigFile, "a calibration (calib.yaml)", FORMAT)
-    return Rig({name: _camera(entry) for name, entry in content.cameras.items()})
-
-
-def _camera(entry: _CameraEntry) -> OrthographicCamera:
-    plane, covariance = None, None
-    if entry.plane is not None:
-        plane = Plane(entry.plane.normal, 1e-3 * entry.plane.offset_mm, 1e-3 * entry.plane.sigma_mm)
-    if entry.covariance is not None:
-        covariance = tuple(map(tuple, entry.covariance))
-    mx, my = entry.pixels_per_mm
-    return OrthographicCamera(
-        entry.image_size,
-        (1e3 * mx, 1e3 * my),
-        1e3 * entry.skew,
-        entry.rotation_vector,
-        entry.offset_px,
-        entry.distortion,
-        plane,
-        entry.time_offset_s,
-        entry.residual_px,
-        covariance,
-    )
+    return Rig({name: entry.camera() for name, entry in content.cameras.items()})
 
 
 def rig_text(rig: Rig) -> str:
@@ -105,16 +140,28 @@ def rig_text(rig: Rig) -> str:
     return yaml.safe_dump({"format": FORMAT, "cameras": cameras}, sort_keys=False, default_flow_style=None)
 
 
-def _entry(camera: OrthographicCamera) -> dict[str, object]:
-    entry: dict[str, object] = {
-        "model": "orthographic",
-        "image_size": list(camera.image_size),
-        "pixels_per_mm": [float(1e-3 * m) for m in camera.scale],
-        "skew": float(1e-3 * camera.skew),
-        "rotation_vector": list(camera.rotation_vector),
-        "offset_px": list(camera.offset),
-        "distortion": list(camera.distortion),
-    }
+def _entry(camera: Camera) -> dict[str, object]:
+    entry: dict[str, object] = {}
+    if isinstance(camera, OrthographicCamera):
+        entry |= {
+            "model": "orthographic",
+            "image_size": list(camera.image_size),
+            "pixels_per_mm": [float(1e-3 * m) for m in camera.scale],
+            "skew": float(1e-3 * camera.skew),
+            "rotation_vector": list(camera.rotation_vector),
+            "offset_px": list(camera.offset),
+            "distortion": list(camera.distortion),
+        }
+    elif isinstance(camera, PinholeCamera):
+        entry |= {
+            "model": "pinhole",
+            "image_size": list(camera.image_size),
+            "focal_px": list(camera.focal),
+            "centre_px": list(camera.centre),
+            "rotation_vector": list(camera.rotation_vector),
+            "translation_mm": [float(1e3 * t) for t in camera.translation],
+            "distortion": list(camera.distortion),
+        }
     if camera.plane is not None:
         entry["plane"] = {
             "normal": list(camera.plane.normal),

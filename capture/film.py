@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from calibration.board import FORMAT as BOARD_FORMAT
 from calibration.board import CharucoPattern
-from calibration.camera import OrthographicCamera, Plane
+from calibration.camera import Camera, OrthographicCamera, Plane
 from calibration.rig import PLANE_SIGMA_MM, Rig, rig_text
 from capture.motion import Motion
 from capture.render import Look, Painter, develop
@@ -64,7 +64,7 @@ def side_cameras(specimen: Specimen, motions: list[Motion], random: np.random.Ge
     extent = MARGIN * (high - low)
     scale = min(IMAGE_SIZE[0] / extent[0], IMAGE_SIZE[1] / extent[2])
     sides = (specimen.mesh.vertices[:, 1].min(), specimen.mesh.vertices[:, 1].max())
-    cameras = {}
+    cameras: dict[str, Camera] = {}
     for (name, axes), side in zip(VIEWS.items(), sides, strict=True):
         off_square = Rotation.from_rotvec(np.radians(random.normal(0.0, 0.6, 3)))
         rotation = off_square.as_matrix() @ np.array(axes)
@@ -136,7 +136,8 @@ def write_board_images(folder: Path, rig: Rig, look: Look, random: np.random.Gen
     tilted by 10 to 40 degrees in places nobody measured.
     """
     world = {}
-    smallest = min(camera.scale[0] for camera in rig.cameras.values())
+    origin_of_all = np.zeros(3)
+    smallest = min(float(np.linalg.norm(camera.slopes(origin_of_all)[0])) for camera in rig.cameras.values())
     columns, rows = (int(0.92 * size / smallest / (1e-3 * BOARD_MM[0])) for size in IMAGE_SIZE)
     squares = (columns, rows)
     pattern = CharucoPattern(
@@ -152,9 +153,8 @@ def write_board_images(folder: Path, rig: Rig, look: Look, random: np.random.Gen
     for name, camera in rig.cameras.items():
         assert camera.plane is not None
         axes = np.array(VIEWS[name])
-        middle = np.linalg.lstsq(
-            camera.matrix, (np.asarray(IMAGE_SIZE) - 1.0) / 2.0 - np.asarray(camera.offset), rcond=None
-        )[0]
+        to_centre = (np.asarray(IMAGE_SIZE) - 1.0) / 2.0 - camera.ideal(origin_of_all)
+        middle = np.linalg.lstsq(camera.slopes(origin_of_all), to_centre, rcond=None)[0]
         normal = np.array(camera.plane.normal)
         middle += (camera.plane.offset - middle @ normal) * normal
         corner = np.round(middle - axes[0] * size[0] / 2 - axes[1] * size[1] / 2, 3)
@@ -185,11 +185,11 @@ def write_board_images(folder: Path, rig: Rig, look: Look, random: np.random.Gen
 
 
 def _board_picture(
-    texture: NDArray[np.uint8], print_scale: float, camera: OrthographicCamera, board: Array, origin: Array
+    texture: NDArray[np.uint8], print_scale: float, camera: Camera, board: Array, origin: Array
 ) -> Array:
     """The print as seen: an affine warp, drawn at twice the size and averaged down."""
-    to_pixels = camera.matrix @ board / (1e3 * print_scale)  # per print pixel
-    shift = camera.matrix @ origin + np.asarray(camera.offset) + to_pixels @ [0.5, 0.5]
+    to_pixels = camera.slopes(origin) @ board / (1e3 * print_scale)  # per print pixel
+    shift = camera.ideal(origin) + to_pixels @ [0.5, 0.5]
     warp = np.column_stack([2 * to_pixels, 2 * shift + 0.5])
     width, height = camera.image_size
     large = cv2.warpAffine(

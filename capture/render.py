@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from calibration.camera import OrthographicCamera
+from calibration.camera import Camera
 from capture.specimen import Specimen
 
 Array = NDArray[Any]
@@ -104,12 +104,12 @@ class Painter:
     """
 
     specimen: Specimen
-    camera: OrthographicCamera
+    camera: Camera
     look: Look
     backdrop: Array
 
     @classmethod
-    def of(cls, specimen: Specimen, camera: OrthographicCamera, look: Look, random: np.random.Generator) -> "Painter":
+    def of(cls, specimen: Specimen, camera: Camera, look: Look, random: np.random.Generator) -> "Painter":
         """A painter with its own backdrop."""
         return cls(specimen, camera, look, _backdrop(specimen, camera, look, random))
 
@@ -119,7 +119,7 @@ class Painter:
         rest = 1e3 * self.specimen.mesh.vertices[surface]
         dots, touching = self._dots_of_quads(rest)
         picture = np.zeros_like(self.backdrop)
-        softness = 1e-3 * float(np.mean(self.camera.scale))
+        softness = 1e-3 * float(np.linalg.norm(self.camera.slopes(self.specimen.mesh.vertices.mean(0))[0]))
         # One place inside the pixel per instant smooths the outline; they average to its centre.
         places = np.stack([np.linspace(-0.375, 0.375, len(positions)), _zigzag(len(positions))], axis=1)
         for q, place in zip(positions, places if len(positions) > 1 else np.zeros((1, 2)), strict=True):
@@ -181,7 +181,7 @@ def develop(picture: Array, look: Look, random: np.random.Generator) -> NDArray[
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
-def _backdrop(specimen: Specimen, camera: OrthographicCamera, look: Look, random: np.random.Generator) -> Array:
+def _backdrop(specimen: Specimen, camera: Camera, look: Look, random: np.random.Generator) -> Array:
     width, height = camera.image_size
     picture = np.full((height, width), 60.0)
     if look.background == "clutter":

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundwork import InputError, sha256
-from tracking.tracks import MISSING, read_tracks
+from tracking.fill import MISSING
+from tracking.tracks import read_tracks
 
 Array = NDArray[Any]
 

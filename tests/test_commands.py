@@ -44,7 +44,7 @@ def videos(tmp_path: Path) -> Path:
 
 def camera(size: tuple[int, int] = (200, 160)) -> OrthographicCamera:
     return OrthographicCamera(
-        size, (1e4, 1e4), 0.0, (0.0, 0.0, 0.0), (0.0, 0.0), plane=Plane((0.0, 0.0, 1.0), 0.0, 5e-4)
+        image_size=size, scale=(1e4, 1e4), rotation_vector=(0.0, 0.0, 0.0), plane=Plane((0.0, 0.0, 1.0), 0.0, 5e-4)
     )
 
 
@@ -78,8 +78,34 @@ def test_tracking_refuses(videos: Path, run: Run, tmp_path: Path) -> None:
     (tmp_path / "other.yaml").write_text("cameras: []")
     refused("other.yaml", calib="other.yaml")
     refused("--fps", more=("--fill", "3"))
-    (videos / "swing" / "broken.png").write_bytes(b"no picture")
-    refused("broken.png", "cannot be read")
+    refused("--export", "'xlsx'", more=("--fps", "50", "--export", "csv,xlsx"))
+
+
+def test_a_damaged_picture_is_missing_and_named(videos: Path, run: Run, tmp_path: Path) -> None:
+    (videos / "swing" / "003.png").write_bytes(b"no picture")
+    result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--fill", "0")
+    assert result.returncode == 0, result.stderr
+    assert "frames 3 are damaged" in result.stdout
+    with h5py.File(tmp_path / "tracks/swing.h5") as file:
+        assert (file["state"][()] == 1).all(axis=1).tolist() == [True, True, True, False, True, True]
+        assert (file["state"][3] == 0).all()
+
+
+def test_finished_recordings_are_kept_and_others_made_anew(videos: Path, run: Run, tmp_path: Path) -> None:
+    command = ("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--export", "csv,c3d,trc,npy")
+    assert run(*command).returncode == 0
+    path = tmp_path / "tracks/swing.h5"
+    first, time = path.read_bytes(), path.stat().st_mtime_ns
+    again = run(*command)
+    assert "kept 1 recordings" in again.stdout
+    assert path.stat().st_mtime_ns == time
+    # Not by name: a damaged file, or other settings, are no finished work.
+    path.write_bytes(first[: len(first) // 2])
+    assert "kept" not in run(*command).stdout
+    assert path.read_bytes() == first
+    assert "kept" not in run(*command, "--fill", "1").stdout
+    exports = {"report.html", "swing.h5", "swing.csv", "swing.c3d", "swing.trc", "q0.npy"}
+    assert {item.name for item in (tmp_path / "tracks").iterdir()} == exports
 
 
 def test_too_few_markers_are_refused(videos: Path, run: Run, tmp_path: Path) -> None:
@@ -98,7 +124,7 @@ def test_one_failed_recording_does_not_stop_the_others(videos: Path, run: Run, t
     result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50")
     assert result.returncode == 1
     assert "error: recording blank" in result.stderr
-    assert [path.name for path in (tmp_path / "tracks").iterdir()] == ["swing.h5"]
+    assert {path.name for path in (tmp_path / "tracks").iterdir()} == {"report.html", "swing.h5"}
 
 
 @pytest.fixture(scope="module")

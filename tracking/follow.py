@@ -1,58 +1,32 @@
 """Following every dot of a recording through one camera's video."""
 
+import heapq
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from groundwork import InputError
-from tracking.dots import LEAST_CONTRAST, Dots, find_dots, refine
+from tracking.disc import PARAMETERS
+from tracking.dots import Dots, eight_bits, find_spots, fit_dots, start_of
+from tracking.family import Family, find_family
+from tracking.shape import Pattern, recognise
 from tracking.video import Video
 
 Array = NDArray[Any]
 
 FEWEST_MARKERS = 3
-NEIGHBOURS = 6
-GATE = 0.45  # of the dot spacing: how far from its prediction a dot may be
-CALM = 0.2  # of the dot spacing: motion and surprise in a frame below which looking nearby is safe
-SHARES = (1.0, 0.5, 0.0, -0.5, -1.0)  # of the last velocity, tried when the motion is not calm
-SHARP = 0.08  # px: a localisation error that a printed dot stays under
-FAR = 0.15  # of a marker: what a jump of one spacing costs
-
-
-@dataclass(frozen=True)
-class Family:
-    """What the markers of a recording have in common.
-
-    Attributes:
-        dark: darker than their surroundings.
-        radius: median [px].
-        contrast: median [grey levels].
-        sigma: median localisation error [px].
-    """
-
-    dark: bool
-    radius: float
-    contrast: float
-    sigma: float
-
-    def admits(self, dots: Dots) -> NDArray[np.bool_]:
-        """Which dots could be markers of this family, (D)."""
-        with np.errstate(invalid="ignore"):
-            return (
-                (np.abs(np.log(dots.radius / self.radius)) < np.log(1.35))
-                & (dots.flattening > 0.45)
-                & (dots.contrast / self.contrast > 0.3)
-                & (dots.contrast / self.contrast < 3.0)
-                & (np.abs(dots.contrast) > LEAST_CONTRAST)
-                & (dots.residual < 0.2)
-                & (dots.sigma < max(6.0 * self.sigma, 0.1))
-            )
+WORST = 10  # frames whose pictures are kept
+CALM = 0.22  # spacings: surprise up to which the dot at a marker's predicted place is its own
+STRAY = 0.33  # spacings: how far from its prediction a dot found there may be
+SEED_REACH = 2.2  # spacings: how far from where it is expected a marker may be
+ORDERS = 4  # of prediction
+FADING = 0.85  # of what was learned of the oscillation, each frame
+RECHECK = 4  # frames between searches for markers out of sight
+SAME_PLACE = 0.6  # radii: two dots closer than this are one
 
 
 @dataclass(frozen=True)
@@ -62,35 +36,20 @@ class PixelTracks:
     Attributes:
         time: [s], (T), NaN where the video does not say.
         pixel: (T, D, 2), NaN where not measured.
-        sigma: one standard deviation per axis [px], (T, D).
+        sigma: one standard deviation along x and y [px], (T, D, 2).
         start: positions in the first frame [px], (D, 2).
+        damaged: frames that could not be decoded, (T).
+        pictures: the first frame and the worst ten, by number, as JPEG.
+        notes: what the video said that contradicts itself.
     """
 
     time: Array
     pixel: Array
     sigma: Array
     start: Array
-
-
-def find_family(image: NDArray[np.uint8]) -> tuple[Family, Dots] | None:
-    """The markers of a picture: the largest set of well-located dots alike in size and contrast."""
-    best: tuple[float, Family, Dots] | None = None
-    for dark in (True, False):
-        dots = find_dots(image, dark)
-        dots = dots[(dots.residual < 0.15) & (dots.flattening > 0.6)]
-        # A printed dot is located ten times as well as a blot that happens to be round.
-        quality = 1.0 / (1.0 + (dots.sigma / SHARP) ** 2) ** 2
-        for seed in range(len(dots)):
-            alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2)
-            alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)
-            score = float(quality[alike].sum())
-            if best is None or score > best[0]:
-                members = dots[alike]
-                sigma = float(np.median(members.sigma))
-                members = members[members.sigma < max(5.0 * sigma, 0.05)]
-                family = Family(dark, float(np.median(members.radius)), float(np.median(members.contrast)), sigma)
-                best = (score, family, members)
-    return None if best is None else (best[1], best[2])
+    damaged: NDArray[np.bool_]
+    pictures: dict[int, bytes]
+    notes: tuple[str, ...]
 
 
 def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
@@ -101,175 +60,225 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
         tick: called after every frame.
 
     Raises:
-        InputError: fewer than three markers, or a frame that cannot be decoded.
+        InputError: fewer than three markers, or a video that cannot be decoded.
     """
     times: list[float] = []
-    pixels: list[Array] = []
-    sigmas: list[Array] = []
+    pixels: list[Array | None] = []
+    sigmas: list[Array | None] = []
     tracker: Tracker | None = None
-    for time, image in video.pictures():
-        if tracker is None:
-            found = find_family(image)
-            count = 0 if found is None else len(found[1])
-            if found is None or count < FEWEST_MARKERS:
-                raise InputError(
-                    f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in the first frame, "
-                    f"found {count}; check that dots of 3 to 32 px radius contrast with the skin"
-                )
-            tracker = Tracker(*found)
-            pixel, sigma = found[1].centre, found[1].sigma
-        else:
-            pixel, sigma = tracker.advance(image)
-        times.append(np.nan if time is None else time)
+    album = _Album()
+    reading = video.read()
+    for frame in reading:
+        times.append(frame.time)
+        pixel = sigma = None
+        if frame.picture is not None:
+            if tracker is None:
+                found = find_family(frame.picture)
+                count = 0 if found is None else len(found[1])
+                if found is None or count < FEWEST_MARKERS:
+                    raise InputError(
+                        f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in frame "
+                        f"{len(times) - 1}, the first, found {count}; check that dots of 3 to 32 px radius "
+                        "contrast with the skin"
+                    )
+                tracker = Tracker(*found)
+                pixel, sigma = found[1].centre, found[1].sigma
+            else:
+                pixel, sigma = tracker.advance(frame.picture)
+            album.consider(len(times) - 1, frame.picture, sigma)
+        elif tracker is not None:
+            tracker.pass_over()
         pixels.append(pixel)
         sigmas.append(sigma)
         tick()
-    return PixelTracks(np.array(times), np.array(pixels), np.array(sigmas), pixels[0])
+    if tracker is None:
+        raise InputError(f"expected frames in {video.path}, found none that decode; copy it again from the camera")
+    nothing = np.full_like(tracker.pattern.rest, np.nan)
+    return PixelTracks(
+        np.array(times),
+        np.array([nothing if pixel is None else pixel for pixel in pixels]),
+        np.array([nothing if sigma is None else sigma for sigma in sigmas]),
+        tracker.pattern.rest,
+        np.array([pixel is None for pixel in pixels]),
+        album.pictures(),
+        tuple(reading.notes),
+    )
+
+
+class _Album:
+    """The first frame, and those in which most markers are lost or worst located."""
+
+    def __init__(self) -> None:
+        self.first: tuple[int, bytes] | None = None
+        self.worst: list[tuple[float, int, bytes]] = []  # a heap, the least bad on top
+
+    def consider(self, number: int, picture: NDArray, sigma: Array) -> None:
+        """Keeps a picture if it is among the worst so far."""
+        lost = np.isnan(sigma[:, 0])
+        badness = lost.sum() + (0.0 if lost.all() else float(np.nanmax(sigma)))
+        if self.first is not None and len(self.worst) == WORST and badness <= self.worst[0][0]:
+            return
+        shown = cv2.imencode(".jpg", eight_bits(picture), [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
+        if self.first is None:
+            self.first = (number, shown)
+        else:
+            heapq.heappush(self.worst, (badness, number, shown))
+            if len(self.worst) > WORST:
+                heapq.heappop(self.worst)
+
+    def pictures(self) -> dict[int, bytes]:
+        """JPEG by frame."""
+        kept = {number: shown for _, number, shown in self.worst}
+        return kept if self.first is None else {self.first[0]: self.first[1]} | kept
 
 
 class Tracker:
-    """The markers' state between frames: where each was, how it moves, what it looks like."""
+    """Follows the markers of one camera from picture to picture."""
 
-    def __init__(self, family: Family, dots: Dots) -> None:
+    def __init__(self, family: Family, first: Dots) -> None:
         self.family = family
-        self.position = dots.centre.copy()
-        self.velocity = np.zeros_like(self.position)
-        self.missing = np.zeros(len(dots), dtype=int)
-        self.rest = dots.centre.copy()
-        tree = cKDTree(self.rest)
-        self.spacing = float(np.median(tree.query(self.rest, 2)[0][:, 1]))
-        close = tree.sparse_distance_matrix(tree, 1.6 * self.spacing, output_type="coo_matrix")
-        self.piece = connected_components(close, directed=False)[1]
-        self.calm = True
-        self.radius = dots.radius.copy()
-        self.contrast = dots.contrast.copy()
+        self.pattern = Pattern.of(first.centre)
+        self.parameters = first.parameters.copy()
+        self.believed = [first.centre.copy()]  # the last four frames' positions, newest last
+        self.missing = np.zeros(len(first), dtype=int)  # frames since each was seen
+        self.surprise = np.full(ORDERS, np.inf)  # of predictions of each order [spacings]
+        self.swing = np.zeros(2)  # sums from which the oscillation's stiffness follows
+        self.searched = 0  # frames since the last search
 
-    def advance(self, image: NDArray[np.uint8]) -> tuple[Array, Array]:
-        """Positions (D, 2) and sigma (D) in the next picture, NaN where a marker is not seen."""
-        prediction = self._prediction(1.0)
-        pixel = np.full_like(prediction, np.nan)
-        sigma = np.full(len(prediction), np.nan)
-        if self.calm:
-            pixel, sigma = self._where_predicted(image, prediction)
-        if np.isnan(sigma).any() or self._two_in_one_place(pixel):
-            whole = find_dots(image, self.family.dark)
-            pixel, sigma = self._assign(whole[self.family.admits(whole)])
-        seen = np.isfinite(sigma)
-        before = self.position
-        surprise = np.linalg.norm(pixel - prediction, axis=1)[seen]
-        moved = (pixel - before) / (self.missing + 1)[:, None]
-        self.velocity = np.where(seen[:, None], moved, 0.0)
-        self.missing = np.where(seen, 0, self.missing + 1)
-        self.position = np.where(seen[:, None], pixel, before)
-        largest = max(surprise.max(initial=0.0), np.linalg.norm(self.velocity, axis=1).max())
-        self.calm = bool(largest < CALM * self.spacing)
-        return pixel, sigma
+    def advance(self, image: NDArray) -> tuple[Array, Array]:
+        """Positions and sigma (D, 2) in the next picture, NaN where a marker is not seen."""
+        expected = self._expected()
+        dots = None
+        if self.surprise.min() < CALM:
+            dots = self._where_expected(image, expected)
+        wanted = self.missing == 0
+        self.searched += 1
+        if dots is None or np.isnan(dots.sigma[wanted]).any() or not wanted.any() or self.searched >= self._patience():
+            found = self._search(image, expected)
+            better = dots is None or np.isfinite(found.sigma[:, 0]).sum() > np.isfinite(dots.sigma[:, 0]).sum()
+            dots = found if better or dots is None else dots
+            self.searched = 0
+        self._learn(dots)
+        return np.where(np.isfinite(dots.sigma), dots.centre, np.nan), dots.sigma
 
-    def _prediction(self, share: float) -> Array:
-        """At `share` of the last velocity; a marker out of sight moves as its neighbours do."""
-        predicted = self.position + share * self.velocity
-        seen = self.missing == 0
-        if seen.any() and not seen.all():
-            drift = np.where(seen[:, None], predicted - self.rest, np.nan)
-            predicted[~seen] = self.rest[~seen] + self._smoothed(drift)[~seen]
-        return predicted
+    def pass_over(self) -> None:
+        """A frame that shows nothing."""
+        self._remember(self._expected())
+        self.missing += 1
 
-    def _smoothed(self, field: Array) -> Array:
-        """A displacement field (D, 2) with NaN gaps, at every marker from its neighbours: a plane
-        through the six nearest known ones, or the mean of fewer."""
-        known = np.flatnonzero(np.isfinite(field[:, 0]))
-        if not len(known):
-            return np.zeros_like(field)
-        count = min(NEIGHBOURS, len(known))
-        nearest = cKDTree(self.rest[known]).query(self.rest, count)[1].reshape(len(field), count)
-        result = np.empty_like(field)
-        for marker, rows in enumerate(nearest):
-            others = known[rows[known[rows] != marker]]
-            if not len(others):
-                result[marker] = field[known].mean(0)
-                continue
-            offset = (self.rest[others] - self.rest[marker]) / self.spacing
-            design = np.column_stack([np.ones(len(others)), offset])
-            weight = np.exp(-0.25 * (offset**2).sum(1))[:, None]
-            # A little ridge on the slopes: neighbours in one line say nothing across it.
-            normal = design.T @ (weight * design) + np.diag([1e-9, 0.02, 0.02])
-            result[marker] = np.linalg.solve(normal, design.T @ (weight * field[others]))[0]
-        return result
+    def _patience(self) -> float:
+        return RECHECK if (self.missing > 0).any() else np.inf
 
-    def _where_predicted(self, image: NDArray[np.uint8], prediction: Array) -> tuple[Array, Array]:
-        shape = 1.0 / self.radius
-        zero = np.zeros_like(shape)
-        rows = np.clip(prediction[:, 1].astype(int), 0, image.shape[0] - 1)
-        columns = np.clip(prediction[:, 0].astype(int), 0, image.shape[1] - 1)
-        level = image[rows, columns] - self.contrast
-        start = np.column_stack(
-            [prediction, shape, zero, shape, np.full_like(shape, 0.8), self.contrast, level, zero, zero]
-        )
-        dots = refine(image, start)
-        change = dots.contrast / self.contrast
-        good = self.family.admits(dots) & (change > 0.55) & (change < 1.8)
-        self.contrast = np.where(good, dots.contrast, self.contrast)
-        self.radius = np.where(good, dots.radius, self.radius)
-        return np.where(good[:, None], dots.centre, np.nan), np.where(good, dots.sigma, np.nan)
+    def _extrapolated(self, order: int) -> Array:
+        """At rest, at the last velocity, at the last acceleration, or swinging on.
 
-    def _two_in_one_place(self, pixel: Array) -> bool:
-        seen = pixel[np.isfinite(pixel[:, 0])]
-        return len(seen) > 1 and bool((cKDTree(seen).query(seen, 2)[0][:, 1] < 0.5 * self.family.radius).any())
-
-    def _assign(self, dots: Dots) -> tuple[Array, Array]:
-        """All markers to dots at once.
-
-        A pattern of equal dots looks the same one spacing on, so several motions are tried; the one
-        that finds most markers with the smallest jumps is taken.
+        A free oscillation's acceleration falls by stiffness times velocity; one number serves all markers.
         """
-        pixel = np.full_like(self.position, np.nan)
-        sigma = np.full(len(pixel), np.nan)
-        if not len(dots):
-            return pixel, sigma
-        best = max(
-            (self._matching(dots, self._prediction(share), settle=True) for share in SHARES),
-            key=lambda matching: matching.score,
+        last = self.believed
+        order = min(order, len(last) - 1)
+        if order == 0:
+            return last[-1]
+        velocity = last[-1] - last[-2]
+        if order == 1:
+            return last[-1] + velocity
+        acceleration = velocity - last[-2] + last[-3]
+        if order == 3:
+            stiffness = float(np.clip(self.swing[0] / max(self.swing[1], 1e-12), 0.0, 2.0))
+            acceleration = acceleration - stiffness * velocity
+        return last[-1] + velocity + acceleration
+
+    def _expected(self) -> Array:
+        """Where the motion so far puts the markers; those out of sight where the others carry them."""
+        seen = self.missing == 0
+        if not seen.any():
+            return self.believed[-1]
+        expected = self._extrapolated(int(np.argmin(self.surprise)))
+        return expected if seen.all() else self.pattern.carried(expected, seen)
+
+    def _where_expected(self, image: NDArray, expected: Array) -> Dots | None:
+        """The dots at the markers' expected places; None where they are not all their own."""
+        start = self.parameters.copy()
+        start[:, :2] = expected
+        dots = fit_dots(image, start)
+        away = np.linalg.norm(dots.centre - expected, axis=1)
+        good = self.family.admits(dots) & (away < STRAY * self.pattern.spacing)
+        change = dots.contrast / self.parameters[:, 8]
+        good &= (change > 0.5) & (change < 2.0)
+        seen = good & (self.missing == 0)
+        if not seen.any() or np.median(away[seen] / self.pattern.spacing[seen]) > CALM:
+            return None
+        good &= ~self._doubled(dots.centre, good)
+        return _only(dots, good)
+
+    def _doubled(self, centre: Array, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Which markers share a dot with another."""
+        apart = np.linalg.norm(centre[:, None] - centre[None], axis=2)
+        apart[~good] = apart[:, ~good] = np.inf
+        np.fill_diagonal(apart, np.inf)
+        return apart.min(axis=1) < SAME_PLACE * self.family.radius
+
+    def _search(self, image: NDArray, expected: Array) -> Dots:
+        """Every dot near the body, matched to the markers all at once."""
+        margin = (SEED_REACH + 1.0) * float(np.median(self.pattern.spacing)) + 2.0 * self.family.radius
+        margin *= 1.0 + 0.3 * min(int(self.missing.min()), 10)
+        low, high = expected.min(0) - margin, expected.max(0) + margin
+        shape = np.median(self.parameters[:, 2:5], axis=0)
+        level = float(np.median(self.parameters[:, 9]))
+        spots = find_spots(
+            image, self.family.radius, self.family.contrast, (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         )
-        # A dot left over beside a marker left out: the whole row may stand one spacing on.
-        left_over = np.setdiff1d(np.arange(len(dots)), best.dot)
-        for dot in left_over if len(best.marker) < len(pixel) else ():
-            away = dots.centre[dot] - best.expected
-            for marker in np.argsort(np.linalg.norm(away, axis=1))[:3]:
-                if np.linalg.norm(away[marker]) < 1.3 * self.spacing:
-                    shift = np.where((self.piece == self.piece[marker])[:, None], away[marker], 0.0)
-                    other = self._matching(dots, best.expected + shift, settle=False)
-                    best = max(best, other, key=lambda matching: matching.score)
-        pixel[best.marker], sigma[best.marker] = dots.centre[best.dot], dots.sigma[best.dot]
-        return pixel, sigma
+        starts = [start_of(x, y, shape, self.family.contrast, level) for x, y in spots]
+        dots = fit_dots(image, np.array(starts).reshape(-1, PARAMETERS))
+        dots = _apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
+        speed = np.linalg.norm(expected - self.believed[-1], axis=1) / self.pattern.spacing
+        reach = SEED_REACH * (1.0 + 0.3 * min(int(self.missing.min()), 10))
+        trusted = -speed - 0.2 * np.minimum(self.missing, 10)
+        hidden = int(self.missing.min())
+        surprise = float(self.surprise.min())
+        sureness = 0.0 if hidden else 1.0 / (1.0 + (2.0 * surprise) ** 2) if np.isfinite(surprise) else 0.3
+        match = recognise(self.pattern, self.believed[-1], expected, trusted, dots.centre, reach, sureness)
+        chosen = dots[np.maximum(match, 0)] if len(dots) else Dots.none(len(match))
+        return _only(chosen, match >= 0)
 
-    def _matching(self, dots: Dots, expected: Array, *, settle: bool) -> "_Matching":
-        """Markers and their dots; with `settle`, expectations first follow what the neighbours found."""
-        prediction = expected
-        if settle:
-            gate = 1.5 * GATE * self.spacing
-            for _ in range(4):
-                marker, dot = _matched(expected, dots.centre, gate)
-                field = np.full_like(prediction, np.nan)
-                field[marker] = dots.centre[dot] - prediction[marker]
-                expected = prediction + self._smoothed(field)
-                gate = GATE * self.spacing
-        marker, dot = _matched(expected, dots.centre, GATE * self.spacing)
-        jump = np.linalg.norm(dots.centre[dot] - self.position[marker], axis=1) / self.spacing
-        return _Matching(marker, dot, expected, len(marker) - FAR * float(np.minimum(jump, 3.0).sum()))
+    def _learn(self, dots: Dots) -> None:
+        seen = np.isfinite(dots.sigma[:, 0])
+        was = self.missing == 0
+        both = seen & was
+        if both.any():
+            for order in range(min(len(self.believed), ORDERS)):
+                gap = np.linalg.norm(dots.centre - self._extrapolated(order), axis=1)[both] / self.pattern.spacing[both]
+                now = float(np.sqrt((gap**2).mean()))
+                before = self.surprise[order]
+                self.surprise[order] = max(now, 0.7 * before) if np.isfinite(before) else now
+        else:
+            self.surprise[:] = np.inf
+        place = np.where(seen[:, None], dots.centre, self._expected())
+        if seen.any():
+            place = self.pattern.carried(place, seen)
+        self._remember(place)
+        self.missing = np.where(seen, 0, self.missing + 1)
+        self.parameters[seen] = dots.parameters[seen]
+
+    def _remember(self, place: Array) -> None:
+        self.believed = [*self.believed[-3:], place]
+        if len(self.believed) == 4:
+            a, b, c, d = self.believed
+            change = d - 3.0 * c + 3.0 * b - a
+            before = c - b
+            self.swing = FADING * self.swing + [-(change * before).sum(), (before**2).sum()]
 
 
-@dataclass(frozen=True)
-class _Matching:
-    """Pairs of marker and dot, where markers were expected (D, 2), and how good it is."""
-
-    marker: NDArray[np.int64]
-    dot: NDArray[np.int64]
-    expected: Array
-    score: float
+def _only(dots: Dots, good: NDArray[np.bool_]) -> Dots:
+    """The same dots, the others' sigma NaN."""
+    dots.sigma[~good] = np.nan
+    return dots
 
 
-def _matched(expected: Array, found: Array, gate: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    distance = np.linalg.norm(expected[:, None] - found[None], axis=2)
-    row, column = linear_sum_assignment(np.minimum(distance, gate) ** 2)
-    near = distance[row, column] < gate
-    return row[near], column[near]
+def _apart(dots: Dots, nearest: float) -> Dots:
+    """Of dots fitted twice, the better located."""
+    order = np.argsort(dots.sigma.max(axis=1))
+    kept: list[int] = []
+    for row in order:
+        if all(np.hypot(*(dots.centre[row] - dots.centre[other])) > nearest for other in kept):
+            kept.append(int(row))
+    return dots[np.array(kept, dtype=int)]

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from calibration.camera import OrthographicCamera
+from calibration.camera import Camera
 from groundwork import InputError
 from tracking.layout import MarkerLayout
 
@@ -16,7 +16,7 @@ NEAR = 0.4  # of the local spacing: how far a dot may be from where its neighbou
 TURNS = np.radians(np.concatenate([[0], np.repeat(np.arange(15, 181, 15), 2) * np.tile([1, -1], 12)]))
 
 
-def visible_markers(layout: MarkerLayout, camera: OrthographicCamera) -> NDArray[np.int64]:
+def visible_markers(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
     """Indices of the markers on the side of the specimen that faces the camera.
 
     The sides are the flat parts of the layout's convex hull; a layout in one plane is all seen.
@@ -32,7 +32,7 @@ def visible_markers(layout: MarkerLayout, camera: OrthographicCamera) -> NDArray
     return np.flatnonzero((on & facing).any(axis=1))
 
 
-def name_by_layout(dots: Array, layout: MarkerLayout, camera: OrthographicCamera, what: str) -> list[int]:
+def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str) -> list[int]:
     """The layout marker of each dot (-1 for none).
 
     A dot and a marker are taken to be the same, and names spread from there from neighbour to
@@ -51,7 +51,7 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: OrthographicCamera
     """
     markers = visible_markers(layout, camera)
     pixels = camera.undistort(dots)
-    expected = layout.positions[markers] @ camera.matrix.T + np.asarray(camera.offset)
+    expected = camera.ideal(layout.positions[markers])
     best: tuple[float, dict[int, int]] = (-np.inf, {})
     complete = min(len(dots), len(markers))
     for turn in TURNS:

@@ -3,46 +3,72 @@
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
+from calibration.camera import Camera
 from groundwork import whole_file
-from tracking.tracks import FILLED, Tracks
+from tracking.dots import eight_bits
+from tracking.fill import FILLED
+from tracking.tracks import Tracks
 from tracking.video import Video
 
+Array = NDArray[Any]
+
 TRAIL = 15  # frames
-COLOUR, FILLED_COLOUR = (90, 255, 90), (255, 170, 40)
+COLOUR, FILLED_COLOUR, TRAIL_COLOUR = (90, 255, 90), (255, 170, 40), (60, 150, 255)  # red, green, blue
 WIDEST = 1280
 
 
-def write_overlay(path: Path, video: Video, camera: str, tracks: Tracks, tick: Callable[[], None]) -> None:
+def shown_pixels(tracks: Tracks, name: str, camera: Camera) -> Array:
+    """Where to draw the markers in a camera's picture (T, M, 2): as seen, or filled ones as projected."""
+    projected = np.where((tracks.state == FILLED)[..., None], camera.project(tracks.position), np.nan)
+    return np.where(np.isfinite(tracks.pixel[name]), tracks.pixel[name], projected)
+
+
+def annotate(grey: NDArray, pixel: Array, filled: NDArray[np.bool_], names: tuple[str, ...], trails: Array) -> NDArray:
+    """A colour picture with marks and names at pixel (M, 2) and trails (K, M, 2)."""
+    picture = cv2.cvtColor(eight_bits(grey), cv2.COLOR_GRAY2RGB)
+    for marker, name in enumerate(names):
+        trail = trails[:, marker]
+        points = np.rint(trail[np.isfinite(trail[:, 0])]).astype(np.int32)
+        cv2.polylines(picture, [points], False, TRAIL_COLOUR, 1, cv2.LINE_AA)
+        if not np.isfinite(pixel[marker]).all():
+            continue
+        colour = FILLED_COLOUR if filled[marker] else COLOUR
+        x, y = np.rint(pixel[marker]).astype(int).tolist()
+        cv2.circle(picture, (x, y), 3, colour, 1, cv2.LINE_AA)
+        cv2.putText(picture, name, (x + 6, y - 8), cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
+    return picture
+
+
+def write_overlay(
+    path: Path, video: Video, name: str, camera: Camera, tracks: Tracks, tick: Callable[[], None]
+) -> None:
     """Write an H.264 video of one camera's view with names, trails and filled markers in orange.
 
     `tick` is called after every frame.
     """
     shrink = min(1.0, WIDEST / max(video.size))
-    width, height = (int(side * shrink) // 2 * 2 for side in video.size)
-    pixel = tracks.pixel[camera] * shrink
+    width, height = (max(int(side * shrink) // 2 * 2, 2) for side in video.size)
+    pixel = shown_pixels(tracks, name, camera) * shrink
+    offset = camera.time_offset
     with whole_file(path) as temporary, av.open(str(temporary), "w", format="mp4") as output:
         stream = output.add_stream("libx264", rate=Fraction(min(tracks.fps, 25.0)).limit_denominator(100))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
-        for number, (_, grey) in enumerate(video.pictures()):
-            if number >= len(tracks.time):
-                break
-            small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
-            picture = cv2.cvtColor(small, cv2.COLOR_GRAY2RGB)
-            for marker, name in enumerate(tracks.names):
-                colour = FILLED_COLOUR if tracks.state[number, marker] == FILLED else COLOUR
-                trail = pixel[max(number - TRAIL, 0) : number + 1, marker]
-                points = np.rint(trail[np.isfinite(trail[:, 0])]).astype(np.int32)
-                cv2.polylines(picture, [points], False, colour, 1, cv2.LINE_AA)
-                if np.isfinite(pixel[number, marker, 0]):
-                    x, y = np.rint(pixel[number, marker]).astype(int).tolist()
-                    cv2.circle(picture, (x, y), 3, colour, 1, cv2.LINE_AA)
-                    place = (x + 6, y - 8)
-                    cv2.putText(picture, name, place, cv2.FONT_HERSHEY_SIMPLEX, 0.4, colour, 1, cv2.LINE_AA)
-            output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        for number, frame in enumerate(video.read()):
             tick()
+            row = number
+            if np.isfinite(frame.time) and "from the video" in tracks.settings:
+                row = int(np.abs(tracks.time - (frame.time - offset)).argmin())
+            if frame.picture is None or row >= len(tracks.time):
+                continue
+            small = cv2.resize(eight_bits(frame.picture), (width, height), interpolation=cv2.INTER_AREA)
+            trails = pixel[max(row - TRAIL, 0) : row + 1]
+            picture = annotate(small, pixel[row], tracks.state[row] == FILLED, tracks.names, trails)
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
         output.mux(stream.encode())

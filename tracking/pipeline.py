@@ -1,19 +1,23 @@
 """One recording's whole way: videos to tracks."""
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from calibration.rig import Rig, rig_text
-from groundwork import InputError, sha256
+from groundwork import VERSION, InputError, sha256
+from tracking.clock import camera_times, common_clock, delays
+from tracking.fill import MEASURED, fill_gaps
 from tracking.follow import FEWEST_MARKERS, PixelTracks, follow
 from tracking.layout import MarkerLayout
 from tracking.naming import name_by_layout, name_by_rows
-from tracking.reconstruct import CameraPixels, fill_gaps, on_rig_clock, triangulate
-from tracking.tracks import MEASURED, Tracks
+from tracking.reconstruct import CameraPixels, at_times, triangulate
+from tracking.tracks import Tracks, read_tracks
 from tracking.video import Video
 
 Array = NDArray[Any]
@@ -27,11 +31,38 @@ class TrackingSettings:
         layout: of the specimen's markers; None to name by row and column.
         fps: true frames per second; None to believe the video.
         fill: longest gap that is bridged [frames].
+        sync: whether to find the cameras' delays from the motion.
     """
 
     layout: MarkerLayout | None
     fps: float | None
     fill: int
+    sync: bool = False
+
+    def text(self) -> str:
+        """All of it in words, for the tracks file; equal for equal settings."""
+        named = "row and column"
+        if self.layout is not None:
+            digest = hashlib.sha256(repr(self.layout.names).encode() + self.layout.positions.tobytes()).hexdigest()
+            named = f"layout of {len(self.layout.names)} markers {digest[:16]}"
+        clock = "synchronised by the motion" if self.sync else "calibrated"
+        return f"fps = {self.fps or 'from the video'}; fill = {self.fill} frames; clocks {clock}; named by {named}"
+
+
+def finished(path: Path, videos: dict[str, Video], rig: Rig, settings: TrackingSettings) -> Tracks | None:
+    """The tracks at `path`, where they are whole and of just these videos, cameras and settings; else None."""
+    if not path.is_file():
+        return None
+    try:
+        tracks = read_tracks(path)
+    except InputError:
+        return None
+    same = tracks.calibration == rig_text(rig) and tracks.settings == settings.text() and tracks.version == VERSION
+    return tracks if same and tracks.sources == _sources(videos) else None
+
+
+def _sources(videos: dict[str, Video]) -> dict[str, str]:
+    return {video.path.name: sha256(video.path) for video in videos.values()}
 
 
 def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettings, tick: Callable[[], None]) -> Tracks:
@@ -50,67 +81,66 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         if settings.fps is None and video.path.is_dir():
             raise InputError(f"{video.path}: a folder of pictures has no times; give the true rate with --fps")
     followed = {camera: follow(video, tick) for camera, video in videos.items()}
-    frames = min(len(item.time) for item in followed.values())
-    time = _time(followed, videos, settings.fps, frames)
+    times = camera_times({camera: item.time for camera, item in followed.items()}, videos, settings.fps)
     names = {camera: _names(item, videos[camera], rig, camera, settings.layout) for camera, item in followed.items()}
     order = _all_names(names, settings.layout)
-    pixels = {}
-    for camera, item in followed.items():
-        pixel = np.full((frames, len(order), 2), np.nan)
-        sigma = np.full((frames, len(order)), np.nan)
-        for dot, name in enumerate(names[camera]):
-            if name:
-                pixel[:, order.index(name)] = item.pixel[:frames, dot]
-                sigma[:, order.index(name)] = item.sigma[:frames, dot]
-        pixels[camera] = on_rig_clock(CameraPixels(pixel, sigma), time, rig.cameras[camera].time_offset)
+    filmed = {camera: _in_order(item, names[camera], order) for camera, item in followed.items()}
+    ahead = {camera: rig.cameras[camera].time_offset for camera in filmed}
+    notes = [note for item in followed.values() for note in item.notes]
+    if settings.sync and len(filmed) > 1:
+        ahead = delays(rig, filmed, times)
+        notes += [f"camera {camera}: clock {1e3 * delay:+.3f} ms by the motion" for camera, delay in ahead.items()]
+    on_rig = {camera: time - ahead[camera] for camera, time in times.items()}
+    clock = common_clock(on_rig)
+    pixels = {camera: at_times(item, on_rig[camera], clock) for camera, item in filmed.items()}
     position, sigma, residual = triangulate(rig, pixels)
-    position, sigma, state = fill_gaps(position, sigma, time, settings.fill)
+    position, sigma, state = fill_gaps(position, sigma, clock, settings.fill)
     measured = int((state == MEASURED).any(axis=0).sum())
     if measured < FEWEST_MARKERS:
         raise InputError(f"expected at least {FEWEST_MARKERS} markers, tracked {measured}; check the lighting")
+    for camera, item in followed.items():
+        lost = np.flatnonzero(item.damaged)
+        if len(lost):
+            notes.append(f"{videos[camera].path.name}: frames {_ranges(lost)} are damaged and count as missing")
     return Tracks(
-        tuple(order),
-        time,
-        position,
-        sigma,
-        state,
-        {camera: item.pixel for camera, item in pixels.items()},
-        residual,
-        {camera: item.sigma for camera, item in pixels.items()},
-        float(1.0 / np.median(np.diff(time))),
-        rig_text(rig),
-        {str(video.path): sha256(video.path) for video in videos.values()},
-        f"fps = {settings.fps or 'from the video'}; fill = {settings.fill} frames; "
-        f"named by {'layout' if settings.layout else 'row and column'}",
+        names=tuple(order),
+        time=clock - clock[0],
+        position=position,
+        sigma=sigma,
+        state=state,
+        pixel={camera: item.pixel for camera, item in pixels.items()},
+        residual=residual,
+        pixel_sigma={camera: item.sigma for camera, item in pixels.items()},
+        damaged={camera: _on_clock(item.damaged, on_rig[camera], clock) for camera, item in followed.items()},
+        pictures={camera: item.pictures for camera, item in followed.items()},
+        fps=float(1.0 / np.median(np.diff(clock))),
+        calibration=rig_text(rig),
+        sources=_sources(videos),
+        settings=settings.text(),
+        notes=tuple(notes),
     )
 
 
-def _time(followed: dict[str, PixelTracks], videos: dict[str, Video], fps: float | None, frames: int) -> Array:
-    """The recording's clock [s], (T): `fps` where given, else the videos' own timestamps."""
-    if frames < 2:
-        raise InputError("expected at least two frames; is the video complete?")
-    if fps is not None:
-        return np.arange(frames) / fps
-    clocks = {}
-    for camera, item in followed.items():
-        time = item.time[:frames]
-        if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
-            raise InputError(
-                f"{videos[camera].path}: expected a later time with every frame, found another; give the true "
-                "rate with --fps"
-            )
-        clocks[camera] = time
-    first = next(iter(clocks.values()))
-    step = float(np.median(np.diff(first)))
-    for camera, time in clocks.items():
-        late = np.abs(time - first)
-        if late.max() > 0.5 * step:
-            raise InputError(
-                f"{videos[camera].path}: expected the frame times of the other camera, found frame "
-                f"{int(np.argmax(late > 0.5 * step))} {1e3 * late.max():.1f} ms apart; record both cameras "
-                "at one rate, or give the true rate with --fps"
-            )
-    return first
+def _in_order(item: PixelTracks, names: list[str | None], order: list[str]) -> CameraPixels:
+    pixel = np.full((len(item.time), len(order), 2), np.nan)
+    sigma = np.full_like(pixel, np.nan)
+    for dot, name in enumerate(names):
+        if name:
+            pixel[:, order.index(name)] = item.pixel[:, dot]
+            sigma[:, order.index(name)] = item.sigma[:, dot]
+    return CameraPixels(pixel, sigma)
+
+
+def _on_clock(flags: NDArray[np.bool_], own: Array, clock: Array) -> NDArray[np.bool_]:
+    nearest = np.clip(np.searchsorted(own, clock - 0.5 * np.median(np.diff(own))), 0, len(own) - 1)
+    return flags[nearest]
+
+
+def _ranges(frames: NDArray[np.int64]) -> str:
+    """Frames in words: 3, 7 to 9, 12."""
+    runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
+    words = [str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs]
+    return ", ".join(words[:12]) + (f" and {len(words) - 12} more stretches" if len(words) > 12 else "")
 
 
 def _names(item: PixelTracks, video: Video, rig: Rig, camera: str, layout: MarkerLayout | None) -> list[str | None]:

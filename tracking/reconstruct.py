@@ -1,6 +1,5 @@
 """From pixels of calibrated cameras to 3-D positions with their uncertainty."""
 
-import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,10 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
+from calibration.camera import OrthographicCamera
 from calibration.rig import Rig
 from groundwork import InputError
 
 Array = NDArray[Any]
+
+SAME_FRAME = 0.02  # of a frame: clocks closer than this need no interpolation
+WRONG = 6.0  # standard deviations of a residual, and
+WRONG_PIXELS = 1.5  # px on top: beyond both, a camera is taken to have seen something else
+STEPS = 8  # of Gauss and Newton; a pinhole camera's equations are not quite linear
 
 
 @dataclass(frozen=True)
@@ -20,36 +25,55 @@ class CameraPixels:
 
     Attributes:
         pixel: (T, M, 2), NaN where not seen.
-        sigma: [px], (T, M), NaN where not seen.
+        sigma: of each coordinate [px], (T, M, 2), NaN where not seen.
     """
 
     pixel: Array
     sigma: Array
 
 
-def on_rig_clock(pixels: CameraPixels, time: Array, offset: float) -> CameraPixels:
-    """A camera's pixels at the rig's times, its own clock being `offset` [s] ahead."""
-    if offset == 0.0:
-        return pixels
-    pixel = np.full_like(pixels.pixel, np.nan)
-    sigma = np.full_like(pixels.sigma, np.nan)
-    asked = time + offset
+def at_times(pixels: CameraPixels, own: Array, asked: Array) -> CameraPixels:
+    """A camera's pixels at other times than its own, by a cubic through the frames around each.
+
+    NaN outside its recording and where one of the two frames around was not seen.
+
+    Args:
+        pixels: as filmed.
+        own: times of the frames filmed [s], (S).
+        asked: [s], (T).
+    """
+    step = float(np.median(np.diff(own)))
+    nearest = np.abs(asked[:, None] - own[None]).argmin(axis=1) if len(own) < 2000 else _nearest(own, asked)
+    same = np.abs(own[nearest] - asked) < SAME_FRAME * step
+    pixel = np.where(same[:, None, None], pixels.pixel[nearest], np.nan)
+    sigma = np.where(same[:, None, None], pixels.sigma[nearest], np.nan)
+    if same.all():
+        return CameraPixels(pixel, sigma)
     for marker in range(pixel.shape[1]):
-        seen = np.flatnonzero(np.isfinite(pixels.sigma[:, marker]))
+        seen = np.flatnonzero(np.isfinite(pixels.sigma[:, marker, 0]))
         if len(seen) < 4:
             continue
-        spline = CubicSpline(time[seen], pixels.pixel[seen, marker])
-        after = np.searchsorted(time[seen], asked)
-        inside = (after > 0) & (after < len(seen))
-        gap = seen[np.minimum(after, len(seen) - 1)] - seen[np.maximum(after - 1, 0)]
-        usable = inside & (gap == 1)
+        spline = CubicSpline(own[seen], pixels.pixel[seen, marker])
+        after = np.searchsorted(own[seen], asked)
+        inside = (after > 0) & (after < len(seen)) & ~same
+        gap = own[seen[np.minimum(after, len(seen) - 1)]] - own[seen[np.maximum(after - 1, 0)]]
+        usable = inside & (gap < 1.6 * step)
         pixel[usable, marker] = spline(asked[usable])
-        sigma[usable, marker] = np.interp(asked[usable], time[seen], pixels.sigma[seen, marker])
+        for axis in range(2):
+            sigma[usable, marker, axis] = np.interp(asked[usable], own[seen], pixels.sigma[seen, marker, axis])
     return CameraPixels(pixel, sigma)
+
+
+def _nearest(own: Array, asked: Array) -> NDArray[np.int64]:
+    after = np.clip(np.searchsorted(own, asked), 1, len(own) - 1)
+    return after - (asked - own[after - 1] < own[after] - asked)
 
 
 def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array, dict[str, Array]]:
     """Weighted least squares over the cameras that see a marker; its plane where only one does.
+
+    A camera whose residual says that it saw something else is left out; where two disagree and nobody
+    says which is wrong, the marker counts as not seen.
 
     Args:
         rig: the cameras.
@@ -62,67 +86,109 @@ def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array
     Raises:
         InputError: a marker seen by one camera alone that has no plane.
     """
-    shape = next(iter(pixels.values())).sigma.shape
-    normal = np.zeros((*shape, 3, 3))
-    right = np.zeros((*shape, 3))
-    count = np.zeros(shape, dtype=int)
+    seen = {name: np.isfinite(item.sigma[..., 0]) for name, item in pixels.items()}
     ideal = {name: rig.cameras[name].undistort(item.pixel) for name, item in pixels.items()}
+    solved = _Solved.of(rig, pixels, ideal, seen)
+    excess = _excess(rig, pixels, seen, solved.position)
+    wrong = (_count(seen) > 1) & (np.max(list(excess.values()), axis=0) > 0)
+    if wrong.any():
+        seen = _without_wrong(rig, pixels, ideal, seen, wrong)
+        solved = _Solved.of(rig, pixels, ideal, seen)
+    residual = {
+        name: np.linalg.norm(rig.cameras[name].project(solved.position) - item.pixel, axis=-1)
+        for name, item in pixels.items()
+    }
+    return solved.position, solved.sigma, residual
+
+
+def _count(seen: dict[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
+    """How many cameras see each marker, (T, M)."""
+    return np.sum(list(seen.values()), axis=0)
+
+
+@dataclass(frozen=True)
+class _Solved:
+    position: Array
+    sigma: Array
+
+    @classmethod
+    def of(
+        cls, rig: Rig, pixels: dict[str, CameraPixels], ideal: dict[str, Array], seen: dict[str, NDArray[np.bool_]]
+    ) -> "_Solved":
+        """Positions and their standard deviations from the cameras marked as seeing them."""
+        count = _count(seen)
+        position = np.zeros((*count.shape, 3))
+        known = count > 0
+        covariance = np.broadcast_to(np.eye(3), (*count.shape, 3, 3))
+        linear = all(isinstance(rig.cameras[name], OrthographicCamera) for name in pixels)
+        for _ in range(1 if linear else STEPS):
+            normal = np.zeros((*count.shape, 3, 3))
+            right = np.zeros((*count.shape, 3))
+            for name, item in pixels.items():
+                camera = rig.cameras[name]
+                slopes = camera.slopes(position)
+                sigma = np.where(seen[name][..., None], item.sigma, 1.0)
+                weight = np.where(seen[name][..., None], 1.0 / sigma**2, 0.0)
+                gap = np.where(seen[name][..., None], ideal[name] - camera.ideal(position), 0.0)
+                normal += np.einsum("...k,...ki,...kj->...ij", weight, slopes, slopes)
+                right += np.einsum("...k,...ki,...k->...i", weight, slopes, gap)
+                alone = seen[name] & (count == 1)
+                if alone.any():
+                    plane = camera.plane
+                    if plane is None:
+                        raise InputError(
+                            f"camera {name} alone sees some markers, and the calibration gives it no plane; add "
+                            f"`plane: {{normal: ..., offset_mm: ...}}` to camera {name} in calib.yaml"
+                        )
+                    direction = np.array(plane.normal)
+                    normal[alone] += np.outer(direction, direction) / plane.sigma**2
+                    off = plane.offset - position[alone] @ direction
+                    right[alone] += off[:, None] * direction / plane.sigma**2
+            covariance = np.linalg.inv(np.where(known[..., None, None], normal, np.eye(3)))
+            step = (covariance @ right[..., None])[..., 0]
+            position = position + step
+            if np.abs(step).max(initial=0.0) < 1e-12:
+                break
+        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
+        return cls(np.where(known[..., None], position, np.nan), np.where(known[..., None], sigma, np.nan))
+
+
+def _excess(
+    rig: Rig, pixels: dict[str, CameraPixels], seen: dict[str, NDArray[np.bool_]], position: Array
+) -> dict[str, Array]:
+    """By how many pixels each residual (T, M) exceeds what noise and calibration explain; -inf where not seen."""
+    result = {}
     for name, item in pixels.items():
         camera = rig.cameras[name]
-        seen = np.isfinite(item.sigma)
-        weight = np.where(seen, 1.0 / np.where(seen, item.sigma, 1.0) ** 2, 0.0)
-        normal += weight[..., None, None] * (camera.matrix.T @ camera.matrix)
-        gap = np.where(seen[..., None], ideal[name] - np.asarray(camera.offset), 0.0)
-        right += weight[..., None] * (gap @ camera.matrix)
-        count += seen
-    for name, item in pixels.items():
-        alone = np.isfinite(item.sigma) & (count == 1)
-        plane = rig.cameras[name].plane
-        if not alone.any():
-            continue
-        if plane is None:
-            raise InputError(
-                f"camera {name} alone sees some markers, and the calibration gives it no plane; "
-                f"add `plane: {{normal: ..., offset_mm: ...}}` to camera {name} in calib.yaml"
-            )
-        direction = np.array(plane.normal)
-        normal[alone] += np.outer(direction, direction) / plane.sigma**2
-        right[alone] += direction * plane.offset / plane.sigma**2
-    known = count > 0
-    covariance = np.linalg.inv(np.where(known[..., None, None], normal, np.eye(3)))
-    position = np.where(known[..., None], (covariance @ right[..., None])[..., 0], np.nan)
-    variance = np.diagonal(covariance, axis1=-2, axis2=-1)
-    sigma = np.where(known[..., None], np.sqrt(variance), np.nan)
-    residual = {
-        name: np.linalg.norm(rig.cameras[name].project(position) - item.pixel, axis=-1) for name, item in pixels.items()
-    }
-    return position, sigma, residual
+        gap = np.linalg.norm(camera.project(position) - item.pixel, axis=-1)
+        sigma = np.sqrt((item.sigma**2).sum(-1) + 2.0 * camera.residual**2)
+        with np.errstate(invalid="ignore"):
+            result[name] = np.where(seen[name], gap - WRONG * sigma - WRONG_PIXELS, -np.inf)
+    return result
 
 
-def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple[Array, Array, NDArray[np.uint8]]:
-    """Bridge gaps of up to `longest` frames by a cubic through what was measured.
-
-    Sigma grows by half the curve's bend across the gap. Longer gaps stay NaN.
-
-    Returns:
-        Positions, sigma (T, M, 3) and states (T, M): 0 missing, 1 measured, 2 filled.
-    """
-    position, sigma = position.copy(), sigma.copy()
-    state = np.isfinite(position[..., 0]).astype(np.uint8)
-    for marker in range(position.shape[1]):
-        seen = np.flatnonzero(state[:, marker] == 1)
-        if len(seen) < 4 or longest == 0:
-            continue
-        spline = CubicSpline(time[seen], position[seen, marker])
-        for before, after in itertools.pairwise(seen):
-            if not 1 < after - before <= longest + 1:
-                continue
-            gap = np.arange(before + 1, after)
-            curve = spline(time[gap])
-            share = ((time[gap] - time[before]) / (time[after] - time[before]))[:, None]
-            line = (1 - share) * position[before, marker] + share * position[after, marker]
-            base = np.maximum(sigma[before, marker], sigma[after, marker])
-            position[gap, marker] = curve
-            sigma[gap, marker] = np.sqrt(4.0 * base**2 + (0.5 * (curve - line)) ** 2)
-            state[gap, marker] = 2
-    return position, sigma, state
+def _without_wrong(
+    rig: Rig,
+    pixels: dict[str, CameraPixels],
+    ideal: dict[str, Array],
+    seen: dict[str, NDArray[np.bool_]],
+    wrong: NDArray[np.bool_],
+) -> dict[str, NDArray[np.bool_]]:
+    """Who sees what, after leaving out of every wrong point the one camera without which the others agree."""
+    names = list(pixels)
+    count = _count(seen)
+    result = {name: of_camera & ~(wrong & (count == 2)) for name, of_camera in seen.items()}
+    several = wrong & (count > 2)
+    if not several.any():
+        return result
+    worst = np.full((len(names), *wrong.shape), np.inf)
+    for k, left_out in enumerate(names):
+        others = {name: of_camera & (name != left_out) for name, of_camera in seen.items()}
+        position = _Solved.of(rig, pixels, ideal, others).position
+        excess = np.max(list(_excess(rig, pixels, others, position).values()), axis=0)
+        worst[k] = np.where(seen[left_out], excess, np.inf)
+    best = worst.argmin(axis=0)
+    agreed = np.take_along_axis(worst, best[None], axis=0)[0] <= 0
+    for k, name in enumerate(names):
+        result[name] = result[name] & ~(several & (~agreed | (best == k)))
+    return result

@@ -13,7 +13,7 @@ from groundwork import VERSION, InputError, check_format, require_file, whole_fi
 Array = NDArray[Any]
 
 FORMAT = "rafl-tracks/1"
-MISSING, MEASURED, FILLED = 0, 1, 2
+OF_CAMERA = ("pixel", "residual", "pixel_sigma", "damaged")
 
 
 @dataclass(frozen=True)
@@ -28,11 +28,15 @@ class Tracks:
         state: 0 missing, 1 measured, 2 filled, (T, M).
         pixel: by camera (T, M, 2) [px], NaN where not seen.
         residual: reprojection residual by camera, (T, M) [px].
-        pixel_sigma: one standard deviation of each pixel by camera, (T, M) [px].
+        pixel_sigma: one standard deviation of each coordinate by camera, (T, M, 2) [px].
+        damaged: frames by camera that could not be decoded, (T).
+        pictures: by camera, the first frame and the worst, by number, as JPEG.
         fps: frames per second.
         calibration: text of calib.yaml; empty for positions from elsewhere.
         sources: SHA-256 by source file.
         settings: text of the settings used.
+        notes: what the videos said that contradicts itself.
+        version: of the program that tracked.
     """
 
     names: tuple[str, ...]
@@ -43,10 +47,14 @@ class Tracks:
     pixel: dict[str, Array]
     residual: dict[str, Array]
     pixel_sigma: dict[str, Array]
+    damaged: dict[str, NDArray[np.bool_]]
+    pictures: dict[str, dict[int, bytes]]
     fps: float
     calibration: str
     sources: dict[str, str]
     settings: str
+    notes: tuple[str, ...] = ()
+    version: str = VERSION
 
 
 def write_tracks(path: Path, tracks: Tracks) -> None:
@@ -59,16 +67,19 @@ def write_tracks(path: Path, tracks: Tracks) -> None:
                 "fps": tracks.fps,
                 "units": "s, m, px; world frame of the calibration",
                 "calibration": tracks.calibration,
-                "software": f"rafl {VERSION}",
+                "software": f"rafl {tracks.version}",
                 "settings": tracks.settings,
+                "notes": np.array(tracks.notes, dtype=h5py.string_dtype()),
                 "sources": np.array([f"{h}  {n}" for n, h in tracks.sources.items()], h5py.string_dtype()),
             }
         )
         for key in ("time", "position", "sigma", "state"):
             file.create_dataset(key, data=getattr(tracks, key), fletcher32=True)
         for name in tracks.pixel:
-            for key in ("pixel", "residual", "pixel_sigma"):
-                file[f"cameras/{name}/{key}"] = getattr(tracks, key)[name]
+            for key in OF_CAMERA:
+                file.create_dataset(f"cameras/{name}/{key}", data=getattr(tracks, key)[name], fletcher32=True)
+            for number, picture in sorted(tracks.pictures[name].items()):
+                file[f"cameras/{name}/pictures/{number}"] = np.frombuffer(picture, np.uint8)
 
 
 def read_tracks(path: Path) -> Tracks:
@@ -83,9 +94,10 @@ def read_tracks(path: Path) -> Tracks:
             check_format(str(file.attrs.get("format", "")), FORMAT, path)
             cameras = file.get("cameras", {})
             lines = [str(line).split("  ", 1) for line in file.attrs["sources"]]
-            of_camera = {
-                key: {name: group[key][()] for name, group in cameras.items()}
-                for key in ("pixel", "residual", "pixel_sigma")
+            of_camera = {key: {name: group[key][()] for name, group in cameras.items()} for key in OF_CAMERA}
+            pictures = {
+                name: {int(number): bytes(data[()]) for number, data in group.get("pictures", {}).items()}
+                for name, group in cameras.items()
             }
             return Tracks(
                 names=tuple(str(name) for name in file.attrs["marker_names"]),
@@ -96,10 +108,14 @@ def read_tracks(path: Path) -> Tracks:
                 pixel=of_camera["pixel"],
                 residual=of_camera["residual"],
                 pixel_sigma=of_camera["pixel_sigma"],
+                damaged=of_camera["damaged"],
+                pictures=pictures,
                 fps=float(file.attrs["fps"]),
                 calibration=str(file.attrs["calibration"]),
                 sources={name: digest for digest, name in lines},
                 settings=str(file.attrs["settings"]),
+                notes=tuple(str(note) for note in file.attrs["notes"]),
+                version=str(file.attrs["software"]).removeprefix("rafl "),
             )
     except (OSError, KeyError, ValueError) as error:
         reason = " ".join(str(error).split())

@@ -1,8 +1,11 @@
 """Grey pictures and their times out of video files and folders of images."""
 
+import heapq
+import queue
 import re
+import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import av
@@ -14,6 +17,38 @@ from groundwork import InputError
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg", ".mpeg", ".ts"}
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+AHEAD = 6  # pictures decoded before they are asked for
+# What makes FFmpeg's decoders report damage instead of painting over it.
+STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame.
+
+    Attributes:
+        time: since the first frame [s]; NaN where unknown.
+        picture: grey levels of 0 to 255 (H, W), uint8, or float32 where the video has more than 8 bits;
+            None where the frame is damaged.
+    """
+
+    time: float
+    picture: NDArray | None
+
+
+@dataclass
+class Reading:
+    """A video being read: iterate for its frames.
+
+    Attributes:
+        notes: what was found on the way that contradicts itself; complete after the last frame.
+    """
+
+    frames: Iterator[Frame]
+    notes: list[str] = field(default_factory=list)
+
+    def __iter__(self) -> Iterator[Frame]:
+        return self.frames
 
 
 @dataclass(frozen=True)
@@ -22,7 +57,7 @@ class Video:
 
     Attributes:
         path: of the file or folder.
-        size: width, height [px].
+        size: width, height, as shown [px].
         frames: how many, as far as the container says; 0 where it does not.
         fps: frames per second, as far as the container says; 0 where it does not.
     """
@@ -32,19 +67,21 @@ class Video:
     frames: int
     fps: float
 
-    def pictures(self) -> Iterator[tuple[float | None, NDArray[np.uint8]]]:
-        """Each frame's time since the first [s] (None where unknown) and its grey levels (H, W).
+    def read(self) -> Reading:
+        """Every frame in order, decoded in a thread of its own, a few ahead.
 
-        Raises:
-            InputError: a frame cannot be decoded; names it.
+        Damaged frames come without a picture, and so do those that refer to them.
         """
-        return _folder_pictures(self.path) if self.path.is_dir() else _file_pictures(self.path)
+        reading = Reading(iter(()))
+        source = _folder_frames(self.path) if self.path.is_dir() else _file_frames(self, reading.notes)
+        reading.frames = _ahead(source)
+        return reading
 
 
 def natural_key(path: Path) -> list[tuple[int, str]]:
     """Sort key under which img2 comes before img10."""
     parts = re.split(r"(\d+)", path.name.lower())
-    return [(int(part), "") if part.isdigit() else (0, part) for part in parts]
+    return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
 
 def _pictures_in(folder: Path) -> list[Path]:
@@ -59,14 +96,17 @@ def is_video(path: Path) -> bool:
 
 
 def open_video(path: Path) -> Video:
-    """Look at a video without decoding it.
+    """Look at a video; only its first frame is decoded.
 
     Raises:
         InputError: missing or unreadable.
     """
     if path.is_dir():
         pictures = _pictures_in(path)
-        first = _read_picture(pictures[0])
+        readable = (picture for picture in map(_read_picture, pictures) if picture is not None)
+        first = next(readable, None)
+        if first is None:
+            raise InputError(f"expected pictures in {path}, none of which can be read; copy them again")
         return Video(path, (first.shape[1], first.shape[0]), len(pictures), 0.0)
     try:
         with av.open(str(path)) as container:
@@ -74,59 +114,231 @@ def open_video(path: Path) -> Video:
                 raise InputError(f"expected a video in {path}, found no video stream; export it again")
             stream = container.streams.video[0]
             fps = float(stream.average_rate) if stream.average_rate else 0.0
-            return Video(path, (stream.width, stream.height), stream.frames, fps)
+            frames, size = stream.frames, (stream.width, stream.height)
+            if min(size) < 1:
+                raise InputError(f"expected a video in {path}, found {size[0]} x {size[1]} px; export it again")
+            if _quarter_turns(container, stream) % 2:
+                size = (size[1], size[0])
+            return Video(path, size, frames, fps)
     except (av.FFmpegError, OSError) as error:
         raise InputError(
             f"expected a video in {path}, which cannot be opened ({error}); copy it again from the camera"
         ) from None
 
 
-def _read_picture(path: Path) -> NDArray[np.uint8]:
-    picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if picture is None:
-        raise InputError(f"expected a picture in {path}, which cannot be read; replace or remove it")
-    return picture
+def _quarter_turns(container: "av.container.InputContainer", stream: "av.video.stream.VideoStream") -> int:
+    """How many quarter turns anticlockwise the first frame asks to be shown by."""
+    for packet in container.demux(stream):
+        try:
+            frames = packet.decode()
+        except av.FFmpegError:
+            continue
+        for frame in frames:
+            return round(frame.rotation / 90.0) % 4
+    return 0
 
 
-def _folder_pictures(folder: Path) -> Iterator[tuple[None, NDArray[np.uint8]]]:
-    size = None
+def _read_picture(path: Path) -> NDArray | None:
+    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+
+
+def _folder_frames(folder: Path) -> Iterator[Frame]:
+    shape: tuple[int, ...] | None = None
+    bits = 8
     for path in _pictures_in(folder):
         picture = _read_picture(path)
-        if size is not None and picture.shape != size:
+        if picture is None:
+            yield Frame(np.nan, None)
+            continue
+        if shape is None:
+            # A 16-bit file may hold 10, 12 or 14 bits; the first picture decides.
+            bits = next(b for b in (8, 10, 12, 14, 16) if int(picture.max()) < 2**b)
+        elif picture.shape != shape:
             raise InputError(f"expected pictures of one size in {folder}, found another in {path.name}; remove it")
-        size = picture.shape
-        yield None, picture
+        shape = picture.shape
+        yield Frame(np.nan, picture if picture.dtype == np.uint8 else _scaled(picture, bits))
 
 
-def _file_pictures(path: Path) -> Iterator[tuple[float | None, NDArray[np.uint8]]]:
-    start = None
+def _scaled(levels: NDArray, bits: int) -> NDArray[np.float32]:
+    return levels.astype(np.float32) * np.float32(0.5 ** (bits - 8))
+
+
+@dataclass
+class _Slots:
+    """Frames the container holds, in the order they are shown.
+
+    Every packet has a slot by its time stamp. A frame that comes out of the decoder fills its own;
+    slots before it that are still empty were lost.
+    """
+
+    base: float
+    waiting: list[int] = field(default_factory=list)
+    damaged: set[int] = field(default_factory=set)
+    start: int | None = None
+
+    def time(self, stamp: int) -> float:
+        if self.start is None:
+            self.start = stamp
+        return (stamp - self.start) * self.base
+
+    def up_to(self, stamp: int | None) -> Iterator[Frame]:
+        """The lost frames before `stamp`, or all that are left."""
+        while self.waiting and (stamp is None or self.waiting[0] < stamp):
+            yield Frame(self.time(heapq.heappop(self.waiting)), None)
+        if self.waiting and self.waiting[0] == stamp:
+            heapq.heappop(self.waiting)
+
+
+def _file_frames(video: Video, notes: list[str]) -> Iterator[Frame]:
+    """Decodes packet by packet in one thread, which is what makes a decoder own up to damage.
+
+    A damaged frame spoils those that refer to it: all up to the next key frame.
+    """
+    path = video.path
     number = 0
+    shown: list[float] = []
+    lost = 0
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
-            for frame in container.decode(stream):
-                if frame.is_corrupt:
-                    raise InputError(f"{path}: frame {number} is damaged; copy the video again from the camera")
-                time = None
-                if frame.pts is not None and frame.time_base is not None:
-                    moment = float(frame.pts * frame.time_base)
-                    start = moment if start is None else start
-                    time = moment - start
-                yield time, _luma(frame)
-                number += 1
+            stream.thread_type = "NONE"
+            stream.codec_context.thread_count = 1
+            stream.codec_context.options = STRICT
+            assert stream.time_base is not None
+            slots = _Slots(float(stream.time_base))
+            broken = False
+            for packet in _packets(container, stream, notes):
+                if packet.size and packet.pts is not None:
+                    heapq.heappush(slots.waiting, packet.pts)
+                frames, trouble = _decoded(packet)
+                broken = trouble if packet.is_keyframe else broken or trouble
+                if broken and packet.pts is not None:
+                    slots.damaged.add(packet.pts)
+                for frame in frames:
+                    spoilt = frame.is_corrupt or (broken if frame.pts is None else frame.pts in slots.damaged)
+                    if frame.pts is not None:
+                        missing = list(slots.up_to(frame.pts))
+                        lost += len(missing)
+                        yield from missing
+                    time = np.nan if frame.pts is None else slots.time(frame.pts)
+                    picture = None if spoilt else _grey(frame)
+                    lost += picture is None
+                    shown.append(time)
+                    yield Frame(time, picture)
+                    number += 1
+            if number:
+                missing = list(slots.up_to(None))
+                lost += len(missing)
+                number += len(missing)
+                yield from missing
     except (av.FFmpegError, OSError) as error:
-        raise InputError(
-            f"{path}: frame {number} cannot be decoded ({error}); copy the video again from the camera"
-        ) from None
+        if number == 0:
+            raise InputError(
+                f"{path}: no frame can be decoded ({error}); copy the video again from the camera"
+            ) from None
+        notes.append(f"{path.name}: reading stopped after frame {number - 1} ({error})")
     if number == 0:
         raise InputError(f"expected frames in {path}, found none; copy the video again from the camera")
+    notes += _contradictions(video, number, np.array(shown))
 
 
-def _luma(frame: av.VideoFrame) -> NDArray[np.uint8]:
-    """The luma plane as it is stored, or the grey of a format without one."""
-    if frame.format.name.startswith(("yuv4", "yuvj4", "gray8", "nv12")) and frame.format.components[0].bits == 8:
+def _packets(
+    container: "av.container.InputContainer", stream: "av.video.stream.VideoStream", notes: list[str]
+) -> Iterator["av.packet.Packet"]:
+    """The stream's packets; where the file breaks off, what came before and a note."""
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets)
+        except StopIteration:
+            return
+        except (av.FFmpegError, OSError) as error:
+            notes.append(f"{container.name}: the file breaks off or is damaged ({error})")
+            return
+        yield packet
+
+
+def _decoded(packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
+    """A packet's frames, and whether the decoder complained."""
+    with av.logging.Capture(local=True) as messages:
+        try:
+            frames = packet.decode()
+        except av.FFmpegError:
+            return [], True
+    complaints = any(level <= av.logging.ERROR for level, _, _ in messages)
+    return frames, complaints or packet.is_corrupt or any(frame.is_corrupt for frame in frames)
+
+
+def _contradictions(video: Video, number: int, time: NDArray) -> list[str]:
+    """What the container says that its frames do not bear out."""
+    notes = []
+    if video.frames and video.frames != number:
+        notes.append(f"{video.path.name}: the file announces {video.frames} frames and holds {number}")
+    step = np.diff(time[np.isfinite(time)])
+    if len(step) and (step <= 0).any():
+        notes.append(f"{video.path.name}: {int((step <= 0).sum())} frames are stamped no later than the one before")
+    elif len(step) > 1 and video.fps:
+        rate = 1.0 / float(np.median(step))
+        if abs(rate / video.fps - 1.0) > 0.02:
+            notes.append(
+                f"{video.path.name}: the file announces {video.fps:.6g} frames/s, its time stamps {rate:.6g}; "
+                "the time stamps are used"
+            )
+        gaps = int((step > 1.5 * np.median(step)).sum())
+        if gaps:
+            notes.append(f"{video.path.name}: {gaps} gaps in the time stamps, where frames were dropped")
+    return notes
+
+
+def _grey(frame: "av.VideoFrame") -> NDArray:
+    """The luma plane as it is stored, or the grey of a format without one, turned as it is to be shown."""
+    name, bits = frame.format.name, frame.format.components[0].bits
+    planar = name.startswith(("yuv4", "yuvj4", "gray", "nv1", "nv2", "p01", "p21", "yuva4")) and not name.endswith("be")
+    if planar and bits <= 16 and not name.startswith("grayf"):
         plane = frame.planes[0]
-        rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
-        return rows[:, : plane.width].copy()
-    return frame.to_ndarray(format="gray")
+        kind = np.uint8 if bits == 8 else np.uint16
+        rows = np.frombuffer(plane, kind).reshape(plane.height, -1)[:, : plane.width]
+        # p010 and its like keep their bits at the upper end.
+        high = name.startswith(("p01", "p21"))
+        picture = rows.copy() if bits == 8 else _scaled(rows, 16 if high else bits)
+    elif bits > 8:
+        picture = _scaled(frame.to_ndarray(format="gray16le"), 16)
+    else:
+        picture = frame.to_ndarray(format="gray")
+    turns = round(frame.rotation / 90.0) % 4
+    return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
+
+
+def _ahead(source: Iterator[Frame]) -> Iterator[Frame]:
+    """The same frames, made in a thread of their own."""
+    made: queue.Queue[Frame | BaseException | None] = queue.Queue(AHEAD)
+    stopped = threading.Event()
+
+    def put(item: Frame | BaseException | None) -> None:
+        while not stopped.is_set():
+            try:
+                made.put(item, timeout=0.2)
+            except queue.Full:
+                continue
+            return
+
+    def work() -> None:
+        try:
+            for frame in source:
+                put(frame)
+                if stopped.is_set():
+                    return
+        except Exception as error:  # handed to whoever reads
+            put(error)
+        put(None)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    try:
+        while (item := made.get()) is not None:
+            if isinstance(item, BaseException):
+                raise item
+            yield item
+    finally:
+        stopped.set()
+        thread.join()

@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from calibration.camera import OrthographicCamera
 
-FRONT = OrthographicCamera((1280, 720), (10_000.0, 9_900.0), 50.0, (0.0, 0.0, 0.0), (600.0, 300.0))
+FRONT = OrthographicCamera(
+    image_size=(1280, 720), scale=(10_000.0, 9_900.0), skew=50.0, rotation_vector=(0.0, 0.0, 0.0), offset=(600.0, 300.0)
+)
 
 
 def test_projection_by_hand() -> None:

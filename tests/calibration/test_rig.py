@@ -7,14 +7,16 @@ from calibration.rig import Rig, read_rig, write_rig
 from groundwork import InputError
 
 CAMERA = OrthographicCamera(
-    (640, 480), (9000.0, 9010.0), 3.0, (0.1, 1.5, -0.2), (12.0, 34.0), (1e-3, 0.0),
-    Plane((0.0, -1.0, 0.0), 0.03, 4e-4), 0.002, 0.05, tuple(tuple(float(i * j) for j in range(10)) for i in range(10)),
+    image_size=(640, 480), scale=(9000.0, 9010.0), skew=3.0, rotation_vector=(0.1, 1.5, -0.2), offset=(12.0, 34.0),
+    distortion=(1e-3, 0.0), plane=Plane((0.0, -1.0, 0.0), 0.03, 4e-4), time_offset=0.002, residual=0.05,
+    covariance=tuple(tuple(float(i * j) for j in range(10)) for i in range(10)),
 )  # fmt: skip
 
 
 def test_round_trip(tmp_path: Path) -> None:
     write_rig(tmp_path / "calib.yaml", Rig({"left": CAMERA}))
     back = read_rig(tmp_path / "calib.yaml").cameras["left"]
+    assert isinstance(back, OrthographicCamera)
     for key in ("scale", "rotation_vector", "offset", "distortion"):
         assert getattr(back, key) == pytest.approx(getattr(CAMERA, key))
     assert back.plane is not None
@@ -29,7 +31,8 @@ def test_round_trip(tmp_path: Path) -> None:
     ("old", "new", "part"),
     [
         ("rafl-calibration/1", "rafl-calibration/2", "newer"),
-        ("orthographic", "pinhole", "left.model"),
+        ("orthographic", "fisheye", "left"),
+        ("orthographic", "pinhole", "focal_px"),
         ("skew", "skewed", "skewed"),
         ("[640, 480]", "[640, 0]", "positive"),
         ("[0.0, -1.0, 0.0]", "[0.0, -2.0, 0.0]", "length 1"),

@@ -18,7 +18,10 @@ def side_camera(tilt_deg: tuple[float, float, float] = (1.0, -0.7, 0.5)) -> Orth
     square = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
     rotation = Rotation.from_rotvec(np.radians(tilt_deg)).as_matrix() @ square
     vector = Rotation.from_matrix(rotation).as_rotvec()
-    return OrthographicCamera(SIZE, (9810.0, 9800.0), 12.0, tuple(vector), (150.0, 400.0), (2e-3, -1e-3))
+    return OrthographicCamera(
+        image_size=SIZE, scale=(9810.0, 9800.0), skew=12.0, rotation_vector=tuple(vector), offset=(150.0, 400.0),
+        distortion=(2e-3, -1e-3),
+    )  # fmt: skip
 
 
 def view_of(camera: OrthographicCamera, pose: WorldPose, name: str, known: bool, noise: float, random) -> View:  # type: ignore[no-untyped-def]

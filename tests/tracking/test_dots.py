@@ -41,7 +41,7 @@ def test_noise_errors_reach_the_bound_and_sigma_says_so() -> None:
         for x, y, *_ in truth:
             k = nearest(dots, (x, y))
             errors.append(dots.centre[k] - (x, y))
-            sigmas.append(dots.sigma[k])
+            sigmas.append(dots.sigma[k].mean())
     rms = np.sqrt((np.array(errors) ** 2).mean())
     edge = np.sqrt(1.0 + 1.0 / 12.0)
     bound = 4.0 / 130.0 * np.sqrt(2 * edge / (8.0 * np.sqrt(np.pi)))

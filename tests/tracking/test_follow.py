@@ -8,7 +8,9 @@ import pytest
 from support import picture
 
 from groundwork import InputError
-from tracking.follow import Tracker, find_family, follow
+from tracking.family import find_family
+from tracking.follow import Tracker, follow
+from tracking.video import Frame, Reading
 
 SIZE = (360, 240)
 
@@ -21,13 +23,14 @@ class Drawn:
     path: Path = Path("drawn.mp4")
     hidden: tuple[int, ...] = ()
 
-    def pictures(self) -> Iterator[tuple[float, np.ndarray]]:
+    def read(self) -> Reading:
+        return Reading(self.frames())
+
+    def frames(self) -> Iterator[Frame]:
         for frame, places in enumerate(self.places):
             shown = places[3:] if frame in self.hidden else places
-            yield (
-                0.01 * frame,
-                picture([(x, y, 6.0, 6.0, 0.0) for x, y in shown], SIZE, noise=2.0, seed=frame),
-            )
+            dots = [(x, y, 6.0, 6.0, 0.0) for x, y in shown]
+            yield Frame(0.01 * frame, picture(dots, SIZE, noise=2.0, seed=frame))
 
 
 def grid(columns: int = 8, rows: int = 3) -> np.ndarray:
@@ -80,7 +83,7 @@ def test_the_family_is_the_dots_not_the_clutter() -> None:
     assert len(dots) == 24
     assert family.dark
     assert family.radius == pytest.approx(6.0, rel=0.05)
-    assert Tracker(family, dots).spacing == pytest.approx(34.0, abs=1.0)
+    assert Tracker(family, dots).pattern.spacing == pytest.approx(34.0, abs=1.0)
 
 
 def test_the_family_is_not_the_background() -> None:

@@ -7,7 +7,9 @@ from groundwork import InputError
 from tracking.layout import MarkerLayout
 from tracking.naming import name_by_layout, name_by_rows, visible_markers
 
-CAMERA = OrthographicCamera((1280, 720), (9000.0, 9000.0), 0.0, (np.pi / 2, 0.0, 0.0), (150.0, 400.0))
+CAMERA = OrthographicCamera(
+    image_size=(1280, 720), scale=(9000.0, 9000.0), rotation_vector=(np.pi / 2, 0.0, 0.0), offset=(150.0, 400.0)
+)
 
 
 def two_sided() -> MarkerLayout:

@@ -24,11 +24,14 @@ def tracks(random: np.random.Generator) -> Tracks:
         state=state,
         pixel={"left": random.normal(size=(*shape, 2))},
         residual={"left": np.zeros(shape)},
-        pixel_sigma={"left": np.full(shape, 0.02)},
+        pixel_sigma={"left": np.full((*shape, 2), 0.02)},
+        damaged={"left": np.zeros(7, dtype=bool)},
+        pictures={"left": {0: b"first", 5: b"worst"}},
         fps=100.0,
         calibration="format: rafl-calibration/1",
         sources={"videos/a  b/left.mp4": "0123abcd"},
         settings="fill = 5",
+        notes=("left.mp4: frames 2 are damaged",),
     )
 
 
@@ -38,9 +41,9 @@ def test_round_trip(tracks: Tracks, tmp_path: Path) -> None:
     back = read_tracks(path)
     for key in ("time", "position", "sigma", "state"):
         np.testing.assert_array_equal(getattr(back, key), getattr(tracks, key))
-    for key in ("pixel", "residual", "pixel_sigma"):
+    for key in ("pixel", "residual", "pixel_sigma", "damaged"):
         np.testing.assert_array_equal(getattr(back, key)["left"], getattr(tracks, key)["left"])
-    for key in ("names", "fps", "calibration", "sources", "settings"):
+    for key in ("names", "fps", "calibration", "sources", "settings", "notes", "pictures", "version"):
         assert getattr(back, key) == getattr(tracks, key)
 
 

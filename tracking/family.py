@@ -1,0 +1,60 @@
+"""What the markers of a recording look like."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking.dots import LEAST_CONTRAST, Dots, find_dots
+
+SHARP = 0.08  # px: a localisation error that a printed dot stays under
+WORST_SIGMA = 0.4  # px: a dot located worse than this is none
+
+
+@dataclass(frozen=True)
+class Family:
+    """What the markers of a recording have in common.
+
+    Attributes:
+        dark: darker than their surroundings.
+        radius: median [px].
+        contrast: median [grey levels].
+    """
+
+    dark: bool
+    radius: float
+    contrast: float
+
+    def admits(self, dots: Dots) -> NDArray[np.bool_]:
+        """Which dots could be markers of this family, (D)."""
+        with np.errstate(invalid="ignore"):
+            return (
+                (np.abs(np.log(dots.radius / self.radius)) < np.log(1.35))
+                & (dots.flattening > 0.45)
+                & (dots.contrast / self.contrast > 0.3)
+                & (dots.contrast / self.contrast < 3.0)
+                & (np.abs(dots.contrast) > LEAST_CONTRAST)
+                & (dots.residual < 0.2)
+                & (dots.used > 0.55)
+                & (dots.sigma.max(axis=1) < WORST_SIGMA)
+            )
+
+
+def find_family(image: NDArray) -> tuple[Family, Dots] | None:
+    """The markers of a picture: the largest set of well-located dots alike in size and contrast."""
+    best: tuple[float, Family, Dots] | None = None
+    for dark in (True, False):
+        dots = find_dots(image, dark)
+        dots = dots[(dots.residual < 0.15) & (dots.flattening > 0.5)]
+        # A printed dot is located ten times as well as a blot that happens to be round.
+        sigma = dots.sigma.max(axis=1)
+        quality = 1.0 / (1.0 + (sigma / SHARP) ** 2) ** 2
+        for seed in range(len(dots)):
+            alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2)
+            alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)
+            score = float(quality[alike].sum())
+            if best is None or score > best[0]:
+                members = dots[alike & (sigma < max(5.0 * float(np.median(sigma[alike])), 0.05))]
+                family = Family(dark, float(np.median(members.radius)), float(np.median(members.contrast)))
+                best = (score, family, members)
+    return None if best is None else (best[1], best[2])

@@ -1,0 +1,155 @@
+"""`report.html` of tracks: one file that shows what was seen, what was filled and where to look twice."""
+
+import base64
+import io
+from pathlib import Path
+
+import cv2
+import jinja2
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.colors import ListedColormap
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from calibration.rig import Rig
+from groundwork import write_text
+from tracking.fill import FILLED, MEASURED, MISSING
+from tracking.overlay import annotate, shown_pixels
+from tracking.tracks import Tracks
+
+WIDEST = 900
+STATE_COLOURS = ["#c0392b", "#4c9f70", "#e6a23c"]  # missing, measured, filled
+
+PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Tracks</title>
+<style>
+ body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}
+ table{border-collapse:collapse;margin:1rem 0}
+ th,td{padding:.25rem .8rem;text-align:right;border-bottom:1px solid #ddd}
+ td:first-child,th:first-child{text-align:left}
+ img{max-width:100%} figure{margin:0 0 1rem 0} .note{color:#666} .strip figure{display:inline-block;width:48%}
+</style>
+<h1>Tracks</h1>
+<table><tr><th>recording</th><th>frames</th><th>markers</th><th>measured</th><th>filled</th><th>missing</th>
+<th>sigma [px]</th><th>residual [px]</th></tr>
+{% for r in recordings %}<tr><td><a href="#{{ r.name }}">{{ r.name }}</a></td>
+{% for cell in r.cells %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
+{% for r in recordings %}
+<h2 id="{{ r.name }}">{{ r.name }}</h2>
+{% for note in r.notes %}<p class="note">{{ note }}</p>{% endfor %}
+<figure><img alt="timeline" src="data:image/png;base64,{{ r.timeline }}"><figcaption class="note">Green: measured.
+Orange: filled. Red: missing.</figcaption></figure>
+{% for c in r.cameras %}
+<h3>Camera {{ c.name }}</h3>
+<figure><img alt="first frame" src="data:image/jpeg;base64,{{ c.first }}"><figcaption class="note">Frame
+{{ c.first_number }}, the first, with the names given.</figcaption></figure>
+<img alt="residuals" src="data:image/png;base64,{{ c.histogram }}">
+{% if c.worst %}<p class="note">The frames in which most markers were lost or worst located:</p>
+<div class="strip">{% for w in c.worst %}<figure><img alt="frame" src="data:image/jpeg;base64,{{ w.picture }}">
+<figcaption class="note">frame {{ w.number }}: {{ w.seen }} of {{ w.all }} seen, largest sigma
+{{ w.sigma }} px</figcaption></figure>{% endfor %}</div>{% endif %}
+{% endfor %}{% endfor %}
+<p class="note">Uncertainties are one standard deviation, from each dot's own fit.</p></html>
+"""
+
+
+def summary_cells(tracks: Tracks) -> list[str]:
+    """Frames, markers, shares measured, filled and missing, median sigma and residual, as text."""
+    state = tracks.state
+    sigma = np.concatenate([values[np.isfinite(values)] for values in tracks.pixel_sigma.values()])
+    residual = np.concatenate([values[np.isfinite(values)] for values in tracks.residual.values()])
+    return [
+        str(len(tracks.time)),
+        str(len(tracks.names)),
+        *(f"{(state == kind).mean():.1%}" for kind in (MEASURED, FILLED, MISSING)),
+        f"{np.median(sigma):.3f}" if len(sigma) else "-",
+        f"{np.sqrt((residual**2).mean()):.3f}" if len(residual) else "-",
+    ]
+
+
+def write_report(path: Path, tracks: dict[str, Tracks], rig: Rig) -> None:
+    """Write the report on all recordings, whole or not at all."""
+    recordings = [
+        {
+            "name": name,
+            "cells": summary_cells(item),
+            "notes": item.notes,
+            "timeline": _timeline(item),
+            "cameras": [_camera(item, camera, rig) for camera in item.pixel],
+        }
+        for name, item in tracks.items()
+    ]
+    page = jinja2.Environment(autoescape=True).from_string(PAGE)
+    write_text(path, page.render(recordings=recordings))
+
+
+def _camera(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
+    pixel = shown_pixels(tracks, name, rig.cameras[name])
+    pictures = tracks.pictures[name]
+    first = min(pictures)
+    sigma = tracks.pixel_sigma[name]
+    worst = []
+    for number in sorted(set(pictures) - {first}):
+        row = min(number, len(sigma) - 1)
+        seen = np.isfinite(sigma[row, :, 0])
+        worst.append(
+            {
+                "number": number,
+                "picture": _picture(pictures[number], tracks, pixel, row),
+                "seen": int(seen.sum()),
+                "all": len(seen),
+                "sigma": f"{np.nanmax(sigma[row]):.2f}" if seen.any() else "-",
+            }
+        )
+    return {
+        "name": name,
+        "first": _picture(pictures[first], tracks, pixel, min(first, len(sigma) - 1)),
+        "first_number": first,
+        "histogram": _histogram(tracks, name),
+        "worst": worst,
+    }
+
+
+def _picture(content: bytes, tracks: Tracks, pixel: NDArray, row: int) -> str:
+    grey = np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE))
+    shrink = min(1.0, WIDEST / grey.shape[1])
+    small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
+    trails = shrink * pixel[max(row - 10, 0) : row + 1]
+    shown = annotate(small, shrink * pixel[row], tracks.state[row] == FILLED, tracks.names, trails)
+    jpeg = cv2.imencode(".jpg", cv2.cvtColor(shown, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+    return base64.b64encode(jpeg.tobytes()).decode()
+
+
+def _timeline(tracks: Tracks) -> str:
+    height = 0.6 + 0.16 * len(tracks.names)
+    figure, axes = plt.subplots(figsize=(9, min(max(height, 1.4), 9)), layout="constrained")
+    end = tracks.time[-1] + 1.0 / tracks.fps
+    axes.imshow(
+        tracks.state.T, aspect="auto", interpolation="nearest", cmap=ListedColormap(STATE_COLOURS), vmin=0, vmax=2,
+        extent=(tracks.time[0], end, len(tracks.names) - 0.5, -0.5),
+    )  # fmt: skip
+    every = max(len(tracks.names) // 40, 1)
+    axes.set_yticks(range(0, len(tracks.names), every), tracks.names[::every], fontsize=7)
+    axes.set_xlabel("time [s]")
+    return _png(figure)
+
+
+def _histogram(tracks: Tracks, name: str) -> str:
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 2.4), layout="constrained")
+    for axes, values, label in (
+        (left, tracks.residual[name], "reprojection residual [px]"),
+        (right, tracks.pixel_sigma[name], "standard deviation of a coordinate [px]"),
+    ):
+        known = values[np.isfinite(values)]
+        if len(known):
+            axes.hist(known, bins=60, range=(0.0, float(np.quantile(known, 0.995)) + 1e-9), color="#1f6fb2")
+        axes.set_xlabel(label)
+        axes.set_yticks([])
+    return _png(figure)
+
+
+def _png(figure: Figure) -> str:
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=100)
+    plt.close(figure)
+    return base64.b64encode(buffer.getvalue()).decode()

@@ -1,0 +1,364 @@
+"""Recognising the markers' pattern after the body that carries them has moved and bent.
+
+Dots all look alike, and from one picture to the next they may move farther than they stand apart: the
+nearest dot is often another marker's. But the markers sit on one smooth body. So a marker and a dot are
+taken to be the same, and the match spreads from neighbour to neighbour, each step trusting the affine map
+of the matches around it. Of all such beginnings the one wins that explains most dots and is nearest to
+where motion puts them.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[Any]
+
+NEIGHBOURS = 8
+GATE = 0.36  # of a marker's spacing: how far from where its neighbours put it a dot may be
+STIFFNESS = 0.04  # of neighbours' own spread: how firmly local maps hold on to the expected one
+FAR = 0.12  # of a marker: what a dot one spacing from its expected place costs, where motion is known
+TURNS = np.radians([0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0])  # tried where the body is lost
+ROUGH = 0.5  # of a marker: what a dot at the gate's edge costs
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Markers at rest in the picture and who stands beside whom.
+
+    Attributes:
+        rest: [px], (M, 2).
+        spacing: of each marker from its nearest neighbour, at least half the median [px], (M).
+        neighbours: nearest first, (M, K); -1 where there are fewer.
+    """
+
+    rest: Array
+    spacing: Array
+    neighbours: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, rest: Array) -> "Pattern":
+        """From positions at rest (M, 2)."""
+        count = min(NEIGHBOURS + 1, len(rest))
+        distance, nearest = cKDTree(rest).query(rest, count)
+        neighbours = np.full((len(rest), NEIGHBOURS), -1)
+        neighbours[:, : count - 1] = nearest[:, 1:]
+        spacing = distance[:, 1]
+        return cls(rest, np.maximum(spacing, 0.5 * np.median(spacing)), neighbours)
+
+    def carried(self, position: Array, known: NDArray[np.bool_]) -> Array:
+        """Where the unknown markers are, by the affine map of the nearest known ones from rest, (M, 2)."""
+        result = position.copy()
+        sources = np.flatnonzero(known)
+        unknown = np.flatnonzero(~known)
+        if not len(sources) or not len(unknown):
+            return result
+        count = min(6, len(sources))
+        nearest = cKDTree(self.rest[sources]).query(self.rest[unknown], count)[1].reshape(len(unknown), count)
+        matrix = np.eye(2)
+        if len(sources) >= 3:
+            matrix = _affine(self.rest[sources], position[sources], np.ones(len(sources)), np.eye(2))
+        for marker, rows in zip(unknown, nearest, strict=True):
+            around = sources[rows]
+            weight = 1.0 / np.linalg.norm(self.rest[around] - self.rest[marker], axis=1)
+            local = _affine(self.rest[around], position[around], weight, matrix)
+            share = weight / weight.sum()
+            offset = self.rest[marker] - share @ self.rest[around]
+            result[marker] = share @ position[around] + local @ offset
+        return result
+
+
+def _affine(source: Array, target: Array, weight: Array, expected: Array) -> Array:
+    """The linear part of the map from source to target (N, 2), drawn a little towards `expected`."""
+    share = weight / weight.sum()
+    source = source - share @ source
+    target = target - share @ target
+    ridge = STIFFNESS * float(share @ (source**2).sum(1)) + 1e-12
+    moment = (share[:, None] * source).T @ source + ridge * np.eye(2)
+    return ((share[:, None] * target).T @ source + ridge * expected) @ np.linalg.inv(moment)
+
+
+@njit(cache=True, nogil=True)
+def _predicted(marker, shape, linear, spacing, neighbours, dots, match):  # type: ignore[no-untyped-def]
+    """Where a marker's matched neighbours put it: their affine map, drawn towards the expected one."""
+    sw = 0.0
+    sx = 0.0
+    sy = 0.0
+    tx = 0.0
+    ty = 0.0
+    for k in range(neighbours.shape[1]):
+        other = neighbours[marker, k]
+        if other >= 0 and match[other] >= 0:
+            g = 1.0 / (np.hypot(shape[other, 0] - shape[marker, 0], shape[other, 1] - shape[marker, 1]) + 1e-9)
+            sw += g
+            sx += g * shape[other, 0]
+            sy += g * shape[other, 1]
+            tx += g * dots[match[other], 0]
+            ty += g * dots[match[other], 1]
+    if sw == 0.0:  # apart from all that is matched: from the nearest matched marker
+        nearest = np.inf
+        chosen = -1
+        for other in range(shape.shape[0]):
+            if match[other] >= 0:
+                gap = np.hypot(shape[other, 0] - shape[marker, 0], shape[other, 1] - shape[marker, 1])
+                if gap < nearest:
+                    nearest = gap
+                    chosen = other
+        sw, sx, sy = 1.0, shape[chosen, 0], shape[chosen, 1]
+        tx, ty = dots[match[chosen], 0], dots[match[chosen], 1]
+    sx /= sw
+    sy /= sw
+    tx /= sw
+    ty /= sw
+    mxx = 0.0
+    mxy = 0.0
+    myy = 0.0
+    nxx = 0.0
+    nxy = 0.0
+    nyx = 0.0
+    nyy = 0.0
+    for k in range(neighbours.shape[1]):
+        other = neighbours[marker, k]
+        if other >= 0 and match[other] >= 0:
+            g = 1.0 / (np.hypot(shape[other, 0] - shape[marker, 0], shape[other, 1] - shape[marker, 1]) + 1e-9) / sw
+            ux, uy = shape[other, 0] - sx, shape[other, 1] - sy
+            vx, vy = dots[match[other], 0] - tx, dots[match[other], 1] - ty
+            mxx += g * ux * ux
+            mxy += g * ux * uy
+            myy += g * uy * uy
+            nxx += g * vx * ux
+            nxy += g * vx * uy
+            nyx += g * vy * ux
+            nyy += g * vy * uy
+    ridge = STIFFNESS * (mxx + myy) + 1e-3 * spacing[marker] ** 2
+    nxx += ridge * linear[marker, 0, 0]
+    nxy += ridge * linear[marker, 0, 1]
+    nyx += ridge * linear[marker, 1, 0]
+    nyy += ridge * linear[marker, 1, 1]
+    mxx += ridge
+    myy += ridge
+    inverse = 1.0 / (mxx * myy - mxy * mxy)
+    ux, uy = shape[marker, 0] - sx, shape[marker, 1] - sy
+    px = (myy * ux - mxy * uy) * inverse
+    py = (mxx * uy - mxy * ux) * inverse
+    return tx + nxx * px + nxy * py, ty + nyx * px + nyy * py
+
+
+@njit(cache=True, nogil=True)
+def _nearest_free(x, y, gate, dots, taken, buckets, cell, origin):  # type: ignore[no-untyped-def]
+    """The nearest dot not taken within the gate of (x, y), -1 for none."""
+    found = -1
+    nearest = gate
+    column, row = int((x - origin[0]) / cell), int((y - origin[1]) / cell)
+    for r in range(max(row - 1, 0), min(row + 2, buckets.shape[0])):
+        for c in range(max(column - 1, 0), min(column + 2, buckets.shape[1])):
+            for k in range(buckets.shape[2]):
+                dot = buckets[r, c, k]
+                if dot < 0:
+                    break
+                gap = np.hypot(dots[dot, 0] - x, dots[dot, 1] - y)
+                if gap < nearest and not taken[dot]:
+                    nearest = gap
+                    found = dot
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match):  # type: ignore[no-untyped-def]
+    """Gives up matches that their neighbours contradict, and looks again for markers that found none."""
+    for _ in range(2):
+        for marker in range(shape.shape[0]):
+            own = match[marker]
+            around = 0
+            for k in range(neighbours.shape[1]):
+                other = neighbours[marker, k]
+                if other >= 0 and match[other] >= 0:
+                    around += 1
+            if around < 3:
+                continue
+            match[marker] = -1
+            x, y = _predicted(marker, shape, linear, spacing, neighbours, dots, match)
+            if own >= 0:
+                if np.hypot(dots[own, 0] - x, dots[own, 1] - y) < 1.3 * GATE * spacing[marker]:
+                    match[marker] = own
+                else:
+                    taken[own] = False
+            else:
+                found = _nearest_free(x, y, GATE * spacing[marker], dots, taken, buckets, cell, origin)
+                if found >= 0:
+                    match[marker] = found
+                    taken[found] = True
+
+
+@njit(cache=True, nogil=True)
+def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, seed, match):  # type: ignore[no-untyped-def]
+    """Spread the match of a seed, one marker and one dot; fills match (M) with dots, -1 for none.
+
+    Returns the match's score. buckets (R, C, B): dots by square of side `cell` from `origin`, -1 filled.
+    """
+    count = shape.shape[0]
+    visited = np.zeros(count, np.bool_)
+    taken = np.zeros(dots.shape[0], np.bool_)
+    ready = np.zeros(count, np.int64)  # matched neighbours
+    match[:] = -1
+    marker, found = seed[0], seed[1]
+    while True:
+        visited[marker] = True
+        if found >= 0:
+            match[marker] = found
+            taken[found] = True
+            for k in range(neighbours.shape[1]):
+                if neighbours[marker, k] >= 0:
+                    ready[neighbours[marker, k]] += 1
+        best = -1
+        for other in range(count):
+            if not visited[other] and (best < 0 or ready[other] > ready[best]):
+                best = other
+        if best < 0:
+            break
+        marker = best
+        x, y = _predicted(marker, shape, linear, spacing, neighbours, dots, match)
+        found = _nearest_free(x, y, GATE * spacing[marker], dots, taken, buckets, cell, origin)
+    _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match)
+    score = 0.0
+    total = (match >= 0).sum()
+    for marker in range(count):
+        found = match[marker]
+        if found < 0:
+            continue
+        score += 1.0
+        if total > 1:
+            match[marker] = -1
+            x, y = _predicted(marker, shape, linear, spacing, neighbours, dots, match)
+            match[marker] = found
+            misfit = np.hypot(dots[found, 0] - x, dots[found, 1] - y) / (GATE * spacing[marker])
+            score -= ROUGH * min(misfit * misfit, 1.5)
+        away = np.hypot(dots[found, 0] - expected[marker, 0], dots[found, 1] - expected[marker, 1])
+        score -= far * min(away / spacing[marker], 3.0)
+    return score
+
+
+@njit(cache=True, nogil=True)
+def _best_growth(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, seeds, enough, best):  # type: ignore[no-untyped-def]
+    """Tries seeds (S, 2) of marker and dot until a score reaches `enough`; fills best (M)."""
+    match = np.empty(shape.shape[0], np.int64)
+    highest = -np.inf
+    for s in range(seeds.shape[0]):
+        # A pair that the best match already holds would grow into the same.
+        if highest > -np.inf and best[seeds[s, 0]] == seeds[s, 1]:
+            continue
+        score = _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, seeds[s], match)
+        if score > highest:
+            highest = score
+            best[:] = match
+        if highest >= enough:
+            break
+    return highest
+
+
+def recognise(
+    pattern: Pattern, shape: Array, expected: Array, trusted: Array, dots: Array, reach: float, sureness: float
+) -> Array:
+    """The dot of each marker, (M), -1 for none.
+
+    Args:
+        pattern: the markers.
+        shape: as last seen [px], (M, 2).
+        expected: where motion puts the markers [px], (M, 2).
+        trusted: how sure that is, larger for surer; seeds are tried in this order, (M).
+        dots: of the new picture [px], (D, 2).
+        reach: how far from where it is expected a seed's dot may be [spacings].
+        sureness: of the expected motion as a whole, 0 to 1.
+    """
+    nobody = np.full(len(shape), -1)
+    if not len(dots):
+        return nobody
+    search = _Search.of(pattern, dots)
+    seeds = search.seeds(expected, trusted, reach)
+    far = FAR * sureness
+    best, score = search.grow(shape, expected, _local_maps(pattern, shape, expected), far, seeds)
+    if (best >= 0).sum() >= min(len(shape), len(dots)):
+        return best
+    # Markers and dots are left over: the body may stand where nobody expects it.
+    for turn in TURNS:
+        cos, sin = np.cos(turn), np.sin(turn)
+        linear = np.tile([[cos, -sin], [sin, cos]], (len(shape), 1, 1))
+        for base in (shape, pattern.rest):
+            other, other_score = search.grow(base, expected, linear, far, seeds)
+            if other_score > score:
+                best, score = other, other_score
+    return best
+
+
+@dataclass(frozen=True)
+class _Search:
+    """The dots of a picture, ready to be searched."""
+
+    pattern: Pattern
+    dots: Array
+    buckets: NDArray[np.int64]
+    cell: float
+    origin: Array
+
+    @classmethod
+    def of(cls, pattern: Pattern, dots: Array) -> "_Search":
+        cell = float(GATE * pattern.spacing.max())
+        return cls(pattern, dots, *_buckets(dots, cell))
+
+    def seeds(self, expected: Array, trusted: Array, reach: float) -> NDArray[np.int64]:
+        """Pairs of marker and dot to begin with, likeliest first, (S, 2)."""
+        pairs: list[tuple[float, int, int]] = []
+        tree = cKDTree(self.dots)
+        for rank, marker in enumerate(np.argsort(-trusted)):
+            spacing = self.pattern.spacing[marker]
+            for dot in tree.query_ball_point(expected[marker], reach * spacing):
+                away = float(np.linalg.norm(self.dots[dot] - expected[marker])) / spacing
+                pairs.append((away + 0.02 * rank, int(marker), dot))
+        pairs.sort()
+        return np.array([pair[1:] for pair in pairs], dtype=np.int64).reshape(-1, 2)
+
+    def grow(
+        self, shape: Array, expected: Array, linear: Array, far: float, seeds: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], float]:
+        """The best match (M) that grows from any seed, and its score."""
+        match = np.full(len(shape), -1)
+        enough = 0.97 * min(len(shape), len(self.dots))
+        score = _best_growth(
+            shape, expected, linear, self.pattern.spacing, self.pattern.neighbours, self.dots, self.buckets, self.cell,
+            self.origin, far, seeds, enough, match,
+        )  # fmt: skip
+        return match, score
+
+
+def _local_maps(pattern: Pattern, shape: Array, expected: Array) -> Array:
+    """The linear part of the motion from `shape` to `expected` about each marker, (M, 2, 2)."""
+    maps = np.tile(np.eye(2), (len(shape), 1, 1))
+    near = pattern.neighbours
+    valid = near >= 0
+    if valid.sum(1).min(initial=NEIGHBOURS) < 2:
+        return maps
+    weight = valid[..., None] / pattern.spacing[:, None, None] ** 2
+    source = (shape[near] - shape[:, None]) * weight
+    target = expected[near] - expected[:, None]
+    source_plain = shape[near] - shape[:, None]
+    ridge = 0.3 * np.eye(2)
+    moment = np.einsum("mki,mkj->mij", source, source_plain) + ridge
+    return (np.einsum("mki,mkj->mij", target, source) + ridge) @ np.linalg.inv(moment)
+
+
+def _buckets(dots: Array, cell: float) -> tuple[NDArray[np.int64], float, Array]:
+    """Dots by square of a grid, (rows, columns, most in one), the squares' side and the grid's corner."""
+    origin = dots.min(axis=0) - 1.5 * cell
+    place = ((dots - origin) / cell).astype(int)
+    columns, rows = place.max(axis=0) + 2
+    flat = place[:, 1] * columns + place[:, 0]
+    order = np.argsort(flat, kind="stable")
+    starts = np.r_[0, np.flatnonzero(np.diff(flat[order])) + 1]
+    counts = np.diff(np.r_[starts, len(order)])
+    buckets = np.full((rows * columns, counts.max()), -1)
+    for start, count in zip(starts, counts, strict=True):
+        buckets[flat[order[start]], :count] = order[start : start + count]
+    return buckets.reshape(rows, columns, -1), cell, origin
