@@ -7,8 +7,8 @@ import functools
 import glob
 import hashlib
 import os
+import platform
 import tempfile
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,13 +20,7 @@ import yaml
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-try:
-    import fcntl
-except ImportError:  # Windows: killed programs' temporary files stay there
-    fcntl = None  # type: ignore[assignment]
-
 VERSION = "0.1.0"
-ABANDONED_AFTER = 10.0  # s: a temporary file younger than this may just be on its way to its lock
 
 Model = TypeVar("Model", bound=pydantic.BaseModel)
 Command = TypeVar("Command", bound=Callable[..., Any])
@@ -95,11 +89,11 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_abandoned(path)
-    handle, name = tempfile.mkstemp(prefix=f".{path.stem}-", suffix=path.suffix, dir=path.parent)
+    prefix = f".{path.stem}-{platform.node()}-{os.getpid()}-"
+    handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
+    os.close(handle)
     temporary = Path(name)
     try:
-        if fcntl is not None:
-            fcntl.flock(handle, fcntl.LOCK_EX)  # falls with the program that holds it
         yield temporary
         descriptor = os.open(temporary, os.O_RDONLY)
         try:
@@ -111,22 +105,21 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.chmod(0o666 & ~umask)
         temporary.replace(path)
     finally:
-        os.close(handle)
         temporary.unlink(missing_ok=True)
 
 
 def _remove_abandoned(path: Path) -> None:
-    """Removes temporary files for `path` that nobody is writing any more."""
-    if fcntl is None:
-        return
-    for temporary in path.parent.glob(f".{glob.escape(path.stem)}-????????{glob.escape(path.suffix)}"):
+    """Removes temporary files for `path` whose program, of this machine, is no longer there."""
+    own = f".{path.stem}-{platform.node()}-"
+    for temporary in path.parent.glob(f"{glob.escape(own)}*-*{glob.escape(path.suffix)}"):
+        pid = temporary.name.removeprefix(own).split("-")[0]
+        if not pid.isdecimal() or os.name == "nt":
+            continue
         try:
-            if time.time() - temporary.stat().st_mtime < ABANDONED_AFTER:
-                continue
-            with temporary.open("rb") as stream:
-                fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                temporary.unlink()
-        except OSError:  # in use, or gone in the meantime
+            os.kill(int(pid), 0)
+        except ProcessLookupError:
+            temporary.unlink(missing_ok=True)
+        except OSError:  # there, and another user's
             continue
 
 
