@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, field_validator
+from pydantic import ConfigDict, Field, field_validator
 from scipy.spatial import cKDTree
 
 from groundwork import InputError, StrictModel, read_yaml
@@ -94,23 +94,64 @@ class DotGridPattern(StrictModel):
         found, centres = cv2.findCirclesGrid(image, (columns, rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
         if not found:
             return np.zeros((0, 2)), np.zeros((0, 2))
-        grid = np.asarray(centres, dtype=float).reshape(rows, columns, 2)
-        if grid[0, 0].sum() > grid[-1, -1].sum():
-            grid = grid[::-1, ::-1]
-        across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-        if across[0] * down[1] - across[1] * down[0] < 0:
-            grid = grid[:, ::-1]
-        j, i = np.meshgrid(np.arange(columns), np.arange(rows))
-        points = 1e-3 * self.spacing_mm * np.stack([j, i], axis=-1)
-        return points.reshape(-1, 2), grid.reshape(-1, 2)
+        return _from_top_left(np.asarray(centres, dtype=float), self.dots, self.spacing_mm)
+
+
+class ChessboardPattern(StrictModel):
+    """A chessboard of `corners` inner columns x rows; origin at the inner corner nearest the picture's top left."""
+
+    kind: Literal["chessboard"]
+    corners: tuple[int, int]
+    square_mm: float = Field(gt=0)
+
+    def find(self, image: NDArray[np.uint8]) -> tuple[Array, Array]:
+        """Board points (P, 2) [m] and their pixels (P, 2) in a grey image."""
+        flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
+        found, corners = cv2.findChessboardCornersSB(image, self.corners, flags=flags)
+        if not found:
+            return np.zeros((0, 2)), np.zeros((0, 2))
+        return _from_top_left(np.asarray(corners, dtype=float), self.corners, self.square_mm)
+
+
+def _from_top_left(found: Array, size: tuple[int, int], pitch_mm: float) -> tuple[Array, Array]:
+    """A regular grid's points [m] and pixels, its origin the end nearest the picture's top left, never mirrored."""
+    columns, rows = size
+    grid = found.reshape(rows, columns, 2)
+    if grid[0, 0].sum() > grid[-1, -1].sum():
+        grid = grid[::-1, ::-1]
+    across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    if across[0] * down[1] - across[1] * down[0] < 0:
+        grid = grid[:, ::-1]
+    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
+    points = 1e-3 * pitch_mm * np.stack([j, i], axis=-1)
+    return points.reshape(-1, 2), grid.reshape(-1, 2)
+
+
+class Move(StrictModel):
+    """A board that was moved, without turning, along a stated direction of the world by an unknown distance."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, populate_by_name=True)
+
+    from_: str = Field(alias="from")
+    to: str
+    along: tuple[float, float, float]
+
+    @field_validator("along")
+    @classmethod
+    def _unit(cls, axis: tuple[float, float, float]) -> tuple[float, float, float]:
+        if abs(np.linalg.norm(axis) - 1.0) > 1e-6:
+            raise ValueError("expected a direction of length 1")
+        return axis
 
 
 class BoardFile(StrictModel):
     """`board.yaml`: the pattern, and by picture (`camera/file`) where the board stood in the world."""
 
     format: str
-    pattern: Annotated[CharucoPattern | DotGridPattern, Field(discriminator="kind")]
+    pattern: Annotated[CharucoPattern | ChessboardPattern | DotGridPattern, Field(discriminator="kind")]
     world: dict[str, WorldPose] = Field(default_factory=dict)
+    moved: list[Move] = Field(default_factory=list)
+    simultaneous: bool = False
 
 
 @dataclass(frozen=True)
@@ -119,12 +160,14 @@ class View:
 
     Attributes:
         name: `camera/file`.
+        board: key of the place where the board stood; the same for pictures taken together.
         points: on the board [m], (P, 2).
         pixels: (P, 2).
         pose: where the board stood, if known.
     """
 
     name: str
+    board: str
     points: Array
     pixels: Array
     pose: WorldPose | None
@@ -152,4 +195,5 @@ def find_board(path: Path, name: str, board: BoardFile) -> tuple[View | None, tu
     points, pixels = board.pattern.find(image)
     if len(points) < FEWEST_POINTS:
         return None, size
-    return View(name, points, pixels, board.world.get(name)), size
+    place = name.partition("/")[2] if board.simultaneous else name
+    return View(name, place, points, pixels, board.world.get(name)), size
