@@ -2,7 +2,8 @@
 
 The outline is |A (x - c)| = 1 with A symmetric. Across it the level changes as the running integral of a
 bell curve whose variance along the outline's normal n is n . W n: lens blur, the pixel's own width and the
-smear of motion during the exposure all add to W. Around the disc the light is level + slope . (x - c).
+smear of motion during the exposure all add to W. The light falls off evenly across the disc and around it,
+by the factor 1 + slopes . (x - c).
 """
 
 from math import comb
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-PARAMETERS = 12  # centre (2), A (3: xx, xy, yy), W (3: xx, xy, yy) [px^2], contrast, level, slope (2)
+PARAMETERS = 12  # centre (2), A (3: xx, xy, yy), W (3: xx, xy, yy) [px^2], contrast, level, slopes of the light (2)
 QUALITY = 7  # converged; centre's variances by independent errors (2), by blocks (2); mean squared residual; share used
 LARGEST = 8192  # pixels a fit looks at
 CHUNK = 256  # pixels whose derivatives are held at a time, so that they stay in the nearest cache
@@ -117,17 +118,9 @@ def _linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-
     sy = np.float32(p[11])
     cx = np.float32(fx)
     cy = np.float32(fy)
-    for k in range(count):
-        dx = w[X + first + k] - cx
-        dy = w[Y + first + k] - cy
-        w[J + k] = -sx
-        w[J + CHUNK + k] = -sy
-        for i in range(2, 9):
+    for i in range(9):
+        for k in range(count):
             w[J + i * CHUNK + k] = np.float32(0.0)
-        w[J + 9 * CHUNK + k] = one
-        w[J + 10 * CHUNK + k] = dx
-        w[J + 11 * CHUNK + k] = dy
-        w[J + 12 * CHUNK + k] = w[VALUE + first + k] - (level + sx * dx + sy * dy)
     share = one / np.float32(instants)
     for instant in range(instants):
         u = np.float32((instant + 0.5) / instants - 0.5)
@@ -182,9 +175,19 @@ def _linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-
                 w[J + 6 * CHUNK + k] += np.float32(2.0) * by_w * xy
                 w[J + 7 * CHUNK + k] += by_w * yy
             w[J + 8 * CHUNK + k] += share * step
-            w[J + 12 * CHUNK + k] -= contrast * step
+    whole = np.float32(p[8])
     for k in range(count):
-        w[RESIDUAL + first + k] = w[J + 12 * CHUNK + k]
+        dx = w[X + first + k] - cx
+        dy = w[Y + first + k] - cy
+        even = level + whole * w[J + 8 * CHUNK + k]
+        w[J + k] -= even * sx
+        w[J + CHUNK + k] -= even * sy
+        w[J + 9 * CHUNK + k] = one
+        w[J + 10 * CHUNK + k] = even * dx
+        w[J + 11 * CHUNK + k] = even * dy
+        residual = w[VALUE + first + k] - even * (one + sx * dx + sy * dy)
+        w[J + 12 * CHUNK + k] = residual
+        w[RESIDUAL + first + k] = residual
 
 
 @njit(**FAST)
@@ -427,7 +430,10 @@ def _minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-de
         _keep_possible(trial, smeared)
         if max(abs(step[0]), abs(step[1])) < NEAR and gain * count < WORTHLESS * best:
             p[:] = trial
-            return True
+            if damping < 1e-4:
+                return True
+            _normal_equations(p, smeared, x0, y0, count, w, H)
+            return _factor(H, 0.0, L)
     return False
 
 

@@ -174,6 +174,7 @@ def find_dots(image: NDArray, dark: bool) -> Dots:
     good = np.isfinite(dots.sigma[:, 0]) & (dots.flattening > FLATTEST) & (dots.residual < 0.25)
     good &= (dots.radius > RADII[0] - 1) & (dots.radius < RADII[1] + 1) & (dots.used > 0.5)
     good &= (np.abs(dots.contrast) > LEAST_CONTRAST) & ((dots.contrast < 0) == dark)
+    good &= (dots.centre > 0).all(axis=1) & (dots.centre < np.array(image.shape[::-1]) - 1).all(axis=1)
     return dots[good]
 
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from tracking.dots import LEAST_CONTRAST, Dots, find_dots
 
 SHARP = 0.08  # px: a localisation error that a printed dot stays under
+UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
 WORST_SIGMA = 0.4  # px: a dot located worse than this is none
 
 
@@ -40,6 +41,15 @@ class Family:
             )
 
 
+def _kin(dots: Dots) -> Dots:
+    """Those that are like most in size, contrast and fit taken together: a blot is a little off in all."""
+    unlike = (np.log(dots.radius / np.median(dots.radius)) / 0.12) ** 2
+    unlike += (np.log(dots.contrast / np.median(dots.contrast)) / 0.35) ** 2
+    worse = dots.residual - np.median(dots.residual)
+    unlike += (np.maximum(worse, 0.0) / max(0.5 * float(np.median(dots.residual)), 0.02)) ** 2
+    return dots[unlike < UNLIKE**2]
+
+
 def find_family(image: NDArray) -> tuple[Family, Dots] | None:
     """The markers of a picture: the largest set of well-located dots alike in size and contrast."""
     best: tuple[float, Family, Dots] | None = None
@@ -54,7 +64,7 @@ def find_family(image: NDArray) -> tuple[Family, Dots] | None:
             alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)
             score = float(quality[alike].sum())
             if best is None or score > best[0]:
-                members = dots[alike & (sigma < max(5.0 * float(np.median(sigma[alike])), 0.05))]
+                members = _kin(dots[alike & (sigma < max(5.0 * float(np.median(sigma[alike])), 0.05))])
                 family = Family(dark, float(np.median(members.radius)), float(np.median(members.contrast)))
                 best = (score, family, members)
     return None if best is None else (best[1], best[2])

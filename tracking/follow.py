@@ -13,6 +13,7 @@ from groundwork import InputError
 from tracking.disc import PARAMETERS
 from tracking.dots import Dots, eight_bits, find_spots, fit_dots, start_of
 from tracking.family import Family, find_family
+from tracking.noise import with_shared_errors
 from tracking.shape import Pattern, recognise
 from tracking.video import Video
 
@@ -94,10 +95,12 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     if tracker is None:
         raise InputError(f"expected frames in {video.path}, found none that decode; copy it again from the camera")
     nothing = np.full_like(tracker.pattern.rest, np.nan)
+    paths = np.array([nothing if pixel is None else pixel for pixel in pixels])
+    fitted = np.array([nothing if sigma is None else sigma for sigma in sigmas])
     return PixelTracks(
         np.array(times),
-        np.array([nothing if pixel is None else pixel for pixel in pixels]),
-        np.array([nothing if sigma is None else sigma for sigma in sigmas]),
+        paths,
+        with_shared_errors(paths, fitted),
         tracker.pattern.rest,
         np.array([pixel is None for pixel in pixels]),
         album.pictures(),

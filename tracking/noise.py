@@ -1,0 +1,54 @@
+"""How well dots were really located: what one picture cannot tell about itself.
+
+Compression moves whole dots a little, most where the picture changes slowly, and leaves no trace in
+the fit. But markers ride on one body: what a marker's path has that the others' do not is error.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
+MODES = 12  # of the body's motion, at most
+MANY = 1500  # frames, evenly chosen, are enough
+TELLING = 0.3  # of a fit's variance: an excess smaller than this may be chance
+
+
+def with_shared_errors(pixel: Array, sigma: Array) -> Array:
+    """Standard deviations (T, D, 2) that also hold what a marker's path has beyond its fits' errors.
+
+    Each marker is predicted from the modes in which the others move. Left as they are where too few
+    frames or markers tell.
+
+    Args:
+        pixel: paths [px], (T, D, 2), NaN where not seen.
+        sigma: from the fits [px], (T, D, 2).
+    """
+    seen = np.isfinite(sigma[..., 0])
+    markers = np.flatnonzero(seen.mean(axis=0) > 0.8)
+    frames = np.flatnonzero(seen[:, markers].all(axis=1)) if len(markers) else np.zeros(0, int)
+    if len(frames) < FEWEST_FRAMES or len(markers) < FEWEST_MARKERS:
+        return sigma
+    frames = frames[:: max(len(frames) // MANY, 1)]
+    path = pixel[np.ix_(frames, markers)]
+    path = path - path.mean(axis=0)
+    count = min(MODES, len(frames) // 4, len(markers) // 2)
+    excess = np.zeros((len(markers), 2))
+    for k in range(len(markers)):
+        others = np.delete(path, k, axis=1).reshape(len(frames), -1)
+        left, size, _ = np.linalg.svd(others, full_matrices=False)
+        basis = left[:, :count]
+        gain = basis.T @ path[:, k]
+        missed = ((path[:, k] - basis @ gain) ** 2).sum(axis=0) / (len(frames) - count)
+        # The modes carry the others' errors too.
+        carried = 1.0 + (gain**2 / size[:count, None] ** 2).sum(axis=0)
+        own = (sigma[np.ix_(frames, markers[k : k + 1])][:, 0] ** 2).mean(axis=0)
+        beyond = missed / carried - own
+        excess[k] = np.where(beyond > TELLING * own, beyond, 0.0)
+    added = np.zeros((sigma.shape[1], 2))
+    added[:] = np.median(excess, axis=0)
+    added[markers] = excess
+    return np.sqrt(sigma**2 + added)
