@@ -136,8 +136,17 @@ def read_rig(path: Path) -> Rig:
 
 def rig_text(rig: Rig) -> str:
     """The content of `calib.yaml`."""
-    cameras = {name: _entry(camera) for name, camera in rig.cameras.items()}
+    cameras = {name: _plain(_entry(camera)) for name, camera in rig.cameras.items()}
     return yaml.safe_dump({"format": FORMAT, "cameras": cameras}, sort_keys=False, default_flow_style=None)
+
+
+def _plain(value: Any) -> Any:
+    """The same in Python's own numbers, which YAML knows."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_plain(item) for item in value]
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def _entry(camera: Camera) -> dict[str, object]:

@@ -50,6 +50,8 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
         InputError: fewer than three dots match the layout.
     """
     markers = visible_markers(layout, camera)
+    if len(dots) > len(markers):  # spheres on stands are seen from behind too
+        markers = np.arange(len(layout.names))
     pixels = camera.undistort(dots)
     expected = camera.ideal(layout.positions[markers])
     best: tuple[float, dict[int, int]] = (-np.inf, {})

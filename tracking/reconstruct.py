@@ -80,14 +80,23 @@ def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array
         pixels: by camera.
 
     Returns:
-        Positions (T, M, 3) [m], NaN where no camera sees the marker; one standard deviation
+        Positions (T, M, 3) [m], NaN where no camera sees the marker, or one that has no plane; one standard deviation
         (T, M, 3) [m]; reprojection residual by camera (T, M) [px].
 
     Raises:
-        InputError: a marker seen by one camera alone that has no plane.
+        InputError: all markers seen by one camera alone that has no plane.
     """
     seen = {name: np.isfinite(item.sigma[..., 0]) for name, item in pixels.items()}
     ideal = {name: rig.cameras[name].undistort(item.pixel) for name, item in pixels.items()}
+    alone = _count(seen) == 1
+    for name in pixels:
+        if rig.cameras[name].plane is None:
+            if (seen[name] & alone).any() and not (_count(seen) > 1).any():
+                raise InputError(
+                    f"camera {name} alone sees the markers, and the calibration gives it no plane; add "
+                    f"`plane: {{normal: ..., offset_mm: ...}}` to camera {name} in calib.yaml"
+                )
+            seen[name] = seen[name] & ~alone
     solved = _Solved.of(rig, pixels, ideal, seen)
     excess = _excess(rig, pixels, seen, solved.position)
     wrong = (_count(seen) > 1) & (np.max(list(excess.values()), axis=0) > 0)
@@ -135,11 +144,7 @@ class _Solved:
                 alone = seen[name] & (count == 1)
                 if alone.any():
                     plane = camera.plane
-                    if plane is None:
-                        raise InputError(
-                            f"camera {name} alone sees some markers, and the calibration gives it no plane; add "
-                            f"`plane: {{normal: ..., offset_mm: ...}}` to camera {name} in calib.yaml"
-                        )
+                    assert plane is not None
                     direction = np.array(plane.normal)
                     normal[alone] += np.outer(direction, direction) / plane.sigma**2
                     off = plane.offset - position[alone] @ direction

@@ -23,6 +23,7 @@ import pandas as pd
 import trackpy
 from motions import Beam, random_beam
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
@@ -600,7 +601,7 @@ def main() -> None:
         table = Table("what", "case", "value", "asked", title=section)
         for row in SECTIONS[section](random, options.quick, **more):
             rows.append((section, row))
-            table.add_row(row.what, row.case, f"{row.value:.4g}", row.asked)
+            table.add_row(escape(row.what), row.case, f"{row.value:.4g}", row.asked)
         Console(width=120).print(table)
     options.out.parent.mkdir(parents=True, exist_ok=True)
     with options.out.open("w", newline="") as stream:
