@@ -22,6 +22,7 @@ CHUNK = 256  # pixels whose derivatives are held at a time, so that they stay in
 
 # Rows of a fit's scratch, one array: so the compiler sees that no two of them overlap.
 X, Y, VALUE, WEIGHT, RESIDUAL, SIZE = (LARGEST * row for row in range(6))
+BLOCK_OF = SIZE  # at another time
 J = 6 * LARGEST  # a chunk's derivatives by the parameters, 12 rows, its residual, and 3 rows never looked at
 WEIGHTED = J + 16 * CHUNK
 SCRATCH = WEIGHTED + CHUNK
@@ -52,6 +53,8 @@ FAST: dict[str, Any] = {
 def _choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
     """The pixels a fit looks at, relative to the rounded centre; returns how many.
 
+    Where the disc's level or its surroundings' is flat every other pixel is enough.
+
     near (K, 3): centre and radius of other dots, whose pixels are left out.
     """
     height, width = image.shape
@@ -60,9 +63,11 @@ def _choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
     spread = np.sqrt(0.25 * (p[2] - p[4]) ** 2 + p[3] ** 2)
     if not half - spread > 0.01:
         return 0
-    largest = 1.0 / (half - spread)
-    margin = 2.0 + 0.3 * largest + 3.0 * np.sqrt(max(0.5 * (p[5] + p[7]), 0.5))
-    window = int(largest + margin) + 1
+    smallest, largest = 1.0 / (half + spread), 1.0 / (half - spread)
+    edge = 3.0 * np.sqrt(max(0.5 * (p[5] + p[7]), 0.5)) + 1.0
+    margin = (1.0 + edge) / smallest + 0.3
+    inside, outside, end = max(1.0 - edge / smallest, 0.0) ** 2, (1.0 + edge / smallest) ** 2, (1.0 + margin) ** 2
+    window = int(largest * (1.0 + margin)) + 1
     count = 0
     fx, fy = p[0] - x0, p[1] - y0
     for row in range(max(y0 - window, 0), min(y0 + window + 1, height)):
@@ -70,11 +75,8 @@ def _choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
             dx, dy = column - x0 - fx, row - y0 - fy
             ax, ay = p[2] * dx + p[3] * dy, p[3] * dx + p[4] * dy
             r2 = ax * ax + ay * ay
-            if r2 > 1.0:
-                gx, gy = p[2] * ax + p[3] * ay, p[3] * ax + p[4] * ay
-                r = np.sqrt(r2)
-                if (r - 1.0) * r > margin * np.sqrt(gx * gx + gy * gy):
-                    continue
+            if r2 > end or ((r2 < inside or r2 > outside) and (row + column) & 1):
+                continue
             taken = False
             for k in range(near.shape[0]):
                 ex, ey = column - near[k, 0], row - near[k, 1]
@@ -321,6 +323,9 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
     for k in range(count):
         reach = max(reach, abs(int(w[X + k])), abs(int(w[Y + k])))
     side = 2 * reach // BLOCK + 2
+    for k in range(count):
+        row, column = (int(w[Y + k]) + reach) // BLOCK, (int(w[X + k]) + reach) // BLOCK
+        w[BLOCK_OF + k] = row * side + column
     blocks = np.zeros((2, side * side))
     white = np.zeros(2)
     score = np.zeros(n)
@@ -329,7 +334,7 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
     for first in range(0, count, CHUNK):
         some = min(CHUNK, count - first)
         _linearise(p, smeared, x0, y0, first, some, w)
-        _add_influence(first, some, reach, side, w, pull, white, blocks)
+        _add_influence(first, some, w, pull, white, blocks)
         squares_here, used_here = _add_scores(first, some, w, score)
         squares += squares_here
         used += used_here
@@ -369,7 +374,7 @@ def _add_scores(first, count, w, score):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _add_influence(first, count, reach, side, w, pull, white, blocks):  # type: ignore[no-untyped-def]
+def _add_influence(first, count, w, pull, white, blocks):  # type: ignore[no-untyped-def]
     """Each pixel's weight in the centre, squared and summed, and times its residual summed by block."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
@@ -385,11 +390,10 @@ def _add_influence(first, count, reach, side, w, pull, white, blocks):  # type: 
         for k in range(count):
             w[WEIGHTED + k] *= w[WEIGHT + first + k]
             total += w[WEIGHTED + k] * w[WEIGHTED + k]
+            w[WEIGHTED + k] *= w[J + 12 * CHUNK + k]
         white[axis] += total
         for k in range(count):
-            row = (int(w[Y + first + k]) + reach) // BLOCK
-            column = (int(w[X + first + k]) + reach) // BLOCK
-            blocks[axis, row * side + column] += w[WEIGHTED + k] * w[J + 12 * CHUNK + k]
+            blocks[axis, int(w[BLOCK_OF + first + k])] += w[WEIGHTED + k]
 
 
 @njit(**FAST)

@@ -1,5 +1,6 @@
 """Finding dots in a picture."""
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,7 +19,11 @@ ROUNDEST = 0.75  # least share of the outline's ellipse that is filled
 LEAST_CONTRAST = 12.0  # grey levels
 LEAST_SIGMA = 1e-3  # px: below it the model's own error counts
 SHARED_NOISE = 1.25  # variance by blocks over that by independent errors, beyond which errors are shared
+ENOUGH_FOR_TWO = 12  # dots, to fit half of them in another thread
 SPOT_SHARE = 0.3  # of the markers' contrast: what a spot must stand out by
+
+
+_POOL = ThreadPoolExecutor(2, thread_name_prefix="dots")
 
 
 @dataclass(frozen=True)
@@ -61,15 +66,15 @@ class Dots:
 
 
 @njit(cache=True, nogil=True)
-def _fit_all(image, fitted, quality):  # type: ignore[no-untyped-def]
-    """Fit every start in fitted (D, 12), overwritten; fills quality (D, QUALITY)."""
-    count = fitted.shape[0]
+def _fit_some(image, start, first, last, fitted, quality):  # type: ignore[no-untyped-def]
+    """Fit starts first to last of start (D, 12); fills fitted (D, 12) and quality (D, QUALITY)."""
+    count = start.shape[0]
     room = np.empty(SCRATCH, np.float32)
-    start = fitted[:, :5].copy()
     radius = 1.0 / np.sqrt(np.abs(start[:, 2] * start[:, 4] - start[:, 3] ** 2))
     near = np.empty((16, 3))
-    for k in range(count):
+    for k in range(first, last):
         found = 0
+        fitted[k] = start[k]
         for other in range(count):
             away = np.hypot(start[other, 0] - start[k, 0], start[other, 1] - start[k, 1])
             if other != k and found < 16 and away < 1.6 * radius[k] + radius[other] + 10.0:
@@ -82,9 +87,13 @@ def _fit_all(image, fitted, quality):  # type: ignore[no-untyped-def]
 
 def fit_dots(image: NDArray, start: Array) -> Dots:
     """Fit a disc to every start (D, 12); see `tracking.disc`."""
-    fitted = np.array(start)
-    quality = np.zeros((len(start), QUALITY))
-    _fit_all(image, fitted, quality)
+    start = np.ascontiguousarray(start)
+    fitted, quality = np.empty_like(start), np.zeros((len(start), QUALITY))
+    half = len(start) // 2 if len(start) >= ENOUGH_FOR_TWO else 0
+    other = _POOL.submit(_fit_some, image, start, 0, half, fitted, quality) if half else None
+    _fit_some(image, start, half, len(start), fitted, quality)
+    if other is not None:
+        other.result()
     determinant = fitted[:, 2] * fitted[:, 4] - fitted[:, 3] ** 2
     mean = 0.5 * (fitted[:, 2] + fitted[:, 4])
     spread = np.sqrt(np.maximum(mean**2 - determinant, 0.0))

@@ -112,27 +112,29 @@ class _Album:
     """The first frame, and those in which most markers are lost or worst located."""
 
     def __init__(self) -> None:
-        self.first: tuple[int, bytes] | None = None
-        self.worst: list[tuple[float, int, bytes]] = []  # a heap, the least bad on top
+        self.first: tuple[int, NDArray] | None = None
+        self.worst: list[tuple[float, int, NDArray]] = []  # a heap, the least bad on top
 
     def consider(self, number: int, picture: NDArray, sigma: Array) -> None:
         """Keeps a picture if it is among the worst so far."""
-        lost = np.isnan(sigma[:, 0])
-        badness = lost.sum() + (0.0 if lost.all() else float(np.nanmax(sigma)))
+        located = sigma[sigma == sigma]  # not NaN
+        badness = len(sigma) - 0.5 * len(located) + float(located.max(initial=0.0))
         if self.first is not None and len(self.worst) == WORST and badness <= self.worst[0][0]:
             return
-        shown = cv2.imencode(".jpg", eight_bits(picture), [cv2.IMWRITE_JPEG_QUALITY, 80])[1].tobytes()
         if self.first is None:
-            self.first = (number, shown)
+            self.first = (number, picture)
         else:
-            heapq.heappush(self.worst, (badness, number, shown))
-            if len(self.worst) > WORST:
-                heapq.heappop(self.worst)
+            push = heapq.heappush if len(self.worst) < WORST else heapq.heappushpop
+            push(self.worst, (badness, number, picture))
 
     def pictures(self) -> dict[int, bytes]:
         """JPEG by frame."""
-        kept = {number: shown for _, number, shown in self.worst}
-        return kept if self.first is None else {self.first[0]: self.first[1]} | kept
+        kept = {number: picture for _, number, picture in self.worst}
+        kept |= {} if self.first is None else {self.first[0]: self.first[1]}
+        quality = [cv2.IMWRITE_JPEG_QUALITY, 80]
+        return {
+            number: cv2.imencode(".jpg", eight_bits(picture), quality)[1].tobytes() for number, picture in kept.items()
+        }
 
 
 class Tracker:
