@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
 from calibration.rig import Rig
@@ -14,6 +15,7 @@ from tracking.video import Video
 Array = NDArray[Any]
 
 LONGEST_DELAY = 12.0  # frames that cameras may have been started apart
+VALLEYS, AS_GOOD = 8, 4.0  # delays looked at closely; how much worse than the best may still be the true one
 FEWEST_COMMON = 3  # markers that two cameras must share to be synchronised by position
 
 
@@ -93,9 +95,13 @@ def delays(rig: Rig, pixels: dict[str, CameraPixels], times: dict[str, Array]) -
                 f"camera {other}: expected motion that shows how its clock stands against camera {first}'s, found "
                 "too little; film a livelier motion, or leave out --sync and set time_offset_s in calib.yaml"
             )
-        best = tried[np.nanargmin(costs)]
-        fine = minimize_scalar(cost, bounds=(best - 0.5 * step, best + 0.5 * step), method="bounded")
-        result[other] = float(fine.x)
+        valleys = [
+            minimize_scalar(cost, bounds=(start - 0.5 * step, start + 0.5 * step), method="bounded")
+            for start in tried[np.argsort(costs)[:VALLEYS]]
+        ]
+        # A swing looks much the same one period on: of delays as good, the shortest.
+        best = min(valley.fun for valley in valleys)
+        result[other] = min((float(valley.x) for valley in valleys if valley.fun < AS_GOOD * best + 1e-9), key=abs)
     return result
 
 
@@ -122,25 +128,24 @@ def _disagreement(rig, pixels, times, first, other, both):  # type: ignore[no-un
 
 
 def _unlikeness(pixels, times, first, other):  # type: ignore[no-untyped-def]
-    """One minus the correlation of the two views' main motions, as a function of the delay [s]."""
+    """The share of one view's motion that the other's does not explain, as a function of the delay [s]."""
 
-    def main_motion(item: CameraPixels) -> Array:
+    def motion(item: CameraPixels, modes: int) -> Array:
         whole = np.isfinite(item.sigma[..., 0]).mean(axis=0) > 0.9
         path = item.pixel[:, whole].reshape(len(item.pixel), -1)
-        mean = np.nanmean(path, axis=0)
-        path = np.where(np.isfinite(path), path - mean, 0.0)
-        mode = np.linalg.svd(path, full_matrices=False)[2][0] if path.size else np.zeros(0)
-        return path @ mode
+        path = np.where(np.isfinite(path), path - np.nanmean(path, axis=0), 0.0)
+        left, size, _ = np.linalg.svd(path, full_matrices=False)
+        return left[:, :modes] * size[:modes]
 
-    mine, theirs = main_motion(pixels[first]), main_motion(pixels[other])
+    mine, theirs = motion(pixels[first], 1), CubicSpline(times[other], motion(pixels[other], 3))
 
     def cost(delay: float) -> float:
         asked = times[first] + delay
         inside = (asked >= times[other][0]) & (asked <= times[other][-1])
         if inside.sum() < 20:
             return np.inf
-        a, b = mine[inside], np.interp(asked[inside], times[other], theirs)
-        a, b = a - a.mean(), b - b.mean()
-        return float(1.0 - abs(a @ b) / (np.linalg.norm(a) * np.linalg.norm(b) + 1e-12))
+        a, b = mine[inside] - mine[inside].mean(axis=0), theirs(asked[inside])
+        basis = np.linalg.qr(b - b.mean(axis=0))[0]
+        return float(1.0 - ((basis.T @ a) ** 2).sum() / ((a**2).sum() + 1e-12))
 
     return cost

@@ -48,7 +48,7 @@ def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple
             if bridge is None:
                 bridge = _along_its_path(position[:, marker], time, frames, before, after)
             filled[gap, marker] = bridge[0]
-            grown[gap, marker] = np.sqrt(base**2 + bridge[1] ** 2)
+            grown[gap, marker] = np.sqrt(1.5 * base**2 + bridge[1] ** 2)
             state[gap, marker] = FILLED
     return filled, grown, state
 

@@ -130,13 +130,76 @@ def _carried(
 
 
 def name_by_rows(dots: Array) -> list[str]:
-    """Names r1c1, r1c2, ... by row from the top and column from the left."""
-    spacing = float(np.median(cKDTree(dots).query(dots, 2)[0][:, 1]))
-    order = np.argsort(dots[:, 1])
-    breaks = np.concatenate([[0], np.cumsum(np.diff(dots[order, 1]) > 0.4 * spacing)])
-    names = [""] * len(dots)
-    for row in range(int(breaks[-1]) + 1):
-        members = order[breaks == row]
-        for column, dot in enumerate(members[np.argsort(dots[members, 0])]):
-            names[dot] = f"r{row + 1}c{column + 1}"
-    return names
+    """Names r1c1, r1c2, ... by row from the top and column from the left.
+
+    Rows may be bent: each dot's neighbours say where the next of its row and column should be. Dots that
+    stand in no such grid are ordered by their height, then from the left.
+    """
+    places = _grid_places(dots)
+    if places is None:
+        spacing = float(np.median(cKDTree(dots).query(dots, 2)[0][:, 1]))
+        order = np.argsort(dots[:, 1])
+        row = np.empty(len(dots), dtype=int)
+        row[order] = np.concatenate([[0], np.cumsum(np.diff(dots[order, 1]) > 0.4 * spacing)])
+        column = np.empty(len(dots), dtype=int)
+        for members in (np.flatnonzero(row == number) for number in range(row.max() + 1)):
+            column[members[np.argsort(dots[members, 0])]] = np.arange(len(members))
+        places = np.stack([row, column], axis=1)
+    return [f"r{row + 1}c{column + 1}" for row, column in places]
+
+
+def _grid_places(dots: Array) -> NDArray[np.int64] | None:
+    """Row and column (D, 2) of dots in a grid, however bent; None where they are in none."""
+    count = min(7, len(dots))
+    tree = cKDTree(dots)
+    nearest = tree.query(dots, count)[1][:, 1:]
+    steps = (dots[nearest] - dots[:, None]).reshape(-1, 2)
+    across, down = _grid_steps(steps)
+    if across is None or down is None:
+        return None
+    places = np.full((len(dots), 2), np.iinfo(int).min)
+    local = {}
+    begin = int(np.argmin(np.linalg.norm(dots - dots.mean(0), axis=1)))
+    places[begin] = 0
+    local[begin] = (across, down)
+    waiting = [begin]
+    while waiting:
+        dot = waiting.pop(0)
+        for axis, sign in ((1, 1), (1, -1), (0, 1), (0, -1)):
+            step = local[dot][0] if axis == 1 else local[dot][1]
+            distance, other = tree.query(dots[dot] + sign * step)
+            if distance > NEAR * np.linalg.norm(step):
+                continue
+            place = places[dot].copy()
+            place[axis] += sign
+            if other in local:
+                if (places[other] != place).any():
+                    return None
+                continue
+            places[other] = place
+            found = sign * (dots[other] - dots[dot])
+            # The grid turns from dot to dot: half of what this step says is believed.
+            turned = 0.5 * (step + found)
+            angle = np.arctan2(turned[1], turned[0]) - np.arctan2(step[1], step[0])
+            spin = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            rest = spin @ (local[dot][1] if axis == 1 else local[dot][0])
+            local[other] = (turned, rest) if axis == 1 else (rest, turned)
+            waiting.append(other)
+    if len(local) < len(dots) or len(np.unique(places, axis=0)) < len(dots):
+        return None
+    return places - places.min(axis=0)
+
+
+def _grid_steps(steps: Array) -> tuple[Array | None, Array | None]:
+    """The most frequent short steps along a row, to the right, and along a column, downwards."""
+    result: list[Array | None] = []
+    for axis in (0, 1):
+        along = steps[np.abs(steps[:, axis]) > 1.2 * np.abs(steps[:, 1 - axis])]
+        along = along * np.sign(along[:, axis : axis + 1])
+        if len(along) < 2:
+            result.append(None)
+            continue
+        length = np.linalg.norm(along, axis=1)
+        short = along[length < 1.4 * np.quantile(length, 0.1)]
+        result.append(np.median(short, axis=0))
+    return result[0], result[1]

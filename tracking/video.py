@@ -1,6 +1,7 @@
 """Grey pictures and their times out of video files and folders of images."""
 
 import heapq
+import logging
 import queue
 import re
 import threading
@@ -18,6 +19,10 @@ from groundwork import InputError
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg", ".mpeg", ".ts"}
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 AHEAD = 6  # pictures decoded before they are asked for
+# Decoders tell of damage in their log; what nobody listens to is nobody's business.
+av.logging.set_level(av.logging.ERROR)
+logging.getLogger("libav").addHandler(logging.NullHandler())
+logging.getLogger("libav").propagate = False
 # What makes FFmpeg's decoders report damage instead of painting over it.
 STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
 
@@ -206,13 +211,19 @@ def _file_frames(video: Video, notes: list[str]) -> Iterator[Frame]:
             stream.codec_context.options = STRICT
             assert stream.time_base is not None
             slots = _Slots(float(stream.time_base))
-            broken = False
+            broken, leading = False, None
             for packet in _packets(container, stream, notes):
                 if packet.size and packet.pts is not None:
                     heapq.heappush(slots.waiting, packet.pts)
                 frames, trouble = _decoded(packet)
-                broken = trouble if packet.is_keyframe else broken or trouble
-                if broken and packet.pts is not None:
+                if packet.is_keyframe:
+                    # Frames shown before this key may come after it, and refer to what was broken.
+                    leading = packet.pts if broken else None
+                    broken = trouble
+                else:
+                    broken = broken or trouble
+                early = leading is not None and packet.pts is not None and packet.pts < leading
+                if (broken or early) and packet.pts is not None:
                     slots.damaged.add(packet.pts)
                 for frame in frames:
                     spoilt = frame.is_corrupt or (broken if frame.pts is None else frame.pts in slots.damaged)

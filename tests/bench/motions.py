@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,8 @@ def random_beam(random: np.random.Generator, frames: int, fastest: float) -> Bea
             low, high = (middle, high) if largest(middle) < fastest else (low, middle)
     else:
         low = high
+    while _nearest(shapes(low)) < 2.4 * radius:  # skin does not fold so far that its dots touch
+        low *= 0.9
     centres = shapes(low)
     angle = random.uniform(0, 2 * np.pi)
     centres = centres @ np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
@@ -71,3 +74,8 @@ def random_beam(random: np.random.Generator, frames: int, fastest: float) -> Bea
     centres += margin - centres.min(axis=(0, 1))
     size = np.ceil(centres.max(axis=(0, 1)) + margin).astype(int)
     return Beam(centres, spacing, radius, (int(size[0]), int(size[1])), largest(low))
+
+
+def _nearest(centres: np.ndarray) -> float:
+    """The least distance of two dots in any frame [px]."""
+    return min(float(cKDTree(frame).query(frame, 2)[0][:, 1].min()) for frame in centres)

@@ -78,3 +78,14 @@ def test_rows_and_columns(random: np.random.Generator) -> None:
     names = name_by_rows(dots[mixed])
     for place, dot in enumerate(mixed):
         assert names[place] == f"r{dot // 4 + 1}c{dot % 4 + 1}"
+
+
+def test_rows_of_a_bent_beam(random: np.random.Generator) -> None:
+    """The tip hangs by more than the rows stand apart."""
+    x, y = np.meshgrid(30.0 * np.arange(10), 24.0 * np.arange(3))
+    slope = 0.9 * x / x.max()
+    dots = np.stack([x - 0.1 * x * slope - y * np.sin(slope), 0.45 * slope * x + y * np.cos(slope)], axis=-1)
+    mixed = random.permutation(30)
+    names = name_by_rows(dots.reshape(-1, 2)[mixed])
+    expected = [f"r{row + 1}c{column + 1}" for row in range(3) for column in range(10)]
+    assert names == [expected[k] for k in mixed]

@@ -1,3 +1,6 @@
+import threading
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -12,6 +15,12 @@ from tracking.recordings import find_recordings
 from tracking.video import open_video
 
 FRAMES = 12
+SAFE = {"libx264": {"g": "6"}, "ffv1": {"level": "3", "slicecrc": "1", "g": "6"}}  # short groups, checksums
+QUIET = {
+    "libx264": {"crf": "4"},
+    "libx265": {"crf": "4", "x265-params": "log-level=none"},
+    "libsvtav1": {"crf": "10", "preset": "10"},
+}
 
 
 def ramp(frame: int) -> np.ndarray:
@@ -38,12 +47,18 @@ def write_video(path: Path, codec: str, pixels: str, rate: int = 100, options: d
         ("a.avi", "mjpeg", "yuvj420p"),
         ("a.mp4", "libx264", "yuv420p"),
         ("a.mov", "prores_ks", "yuv422p10le"),
+        ("b.mkv", "ffv1", "gray10le"),
+        ("c.mkv", "ffv1", "gray16le"),
+        ("d.mp4", "libx265", "yuv420p10le"),
+        ("e.mp4", "libsvtav1", "yuv420p"),
+        ("f.avi", "rawvideo", "gray"),
+        ("g.avi", "rawvideo", "bgr24"),
     ],
 )
 def test_pictures_and_times(tmp_path: Path, name: str, codec: str, pixels: str) -> None:
     """Every frame comes back in order with its time; levels up to the format's own loss and range."""
     path = tmp_path / name
-    write_video(path, codec, pixels, options={"crf": "4"} if codec == "libx264" else None)
+    write_video(path, codec, pixels, options=QUIET.get(codec))
     video = open_video(path)
     assert video.size == (96, 64)
     pictures = [(frame.time, frame.picture) for frame in video.read()]
@@ -51,7 +66,7 @@ def test_pictures_and_times(tmp_path: Path, name: str, codec: str, pixels: str) 
     for number, (time, picture) in enumerate(pictures):
         assert time == pytest.approx(0.01 * number, abs=1e-4)
         assert picture is not None
-        assert picture.dtype == (np.float32 if "10" in pixels else np.uint8)
+        assert picture.dtype == (np.float32 if "10" in pixels or "16" in pixels else np.uint8)
         # An affine map of levels (limited or full range) leaves the picture's shape.
         fit = np.polyfit(ramp(number).ravel(), picture.ravel().astype(float), 1)
         assert 0.8 < fit[0] < 1.2
@@ -70,12 +85,104 @@ def test_a_folder_of_pictures_is_sorted_by_number(tmp_path: Path) -> None:
         np.testing.assert_array_equal(picture, ramp(number))
 
 
-def test_a_cut_file_is_an_error_not_a_short_video(tmp_path: Path) -> None:
+def test_a_file_cut_before_its_first_frame_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write_video(path, "libx264", "yuv420p")
     path.write_bytes(path.read_bytes()[:600])
     with pytest.raises(InputError, match=r"a\.mp4"):
         list(open_video(path).read())
+
+
+def test_of_a_cut_file_what_decodes_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a.mkv"
+    write_video(path, "ffv1", "gray")
+    content = path.read_bytes()
+    path.write_bytes(content[: int(0.6 * len(content))])
+    reading = open_video(path).read()
+    frames = list(reading)
+    whole = [frame for frame in frames if frame.picture is not None]
+    assert 4 <= len(whole) < FRAMES
+    for number, frame in enumerate(whole):
+        np.testing.assert_array_equal(frame.picture, ramp(number))
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels", "intra"),
+    [
+        ("a.mkv", "ffv1", "gray", False),
+        ("a.mov", "prores_ks", "yuv422p10le", True),
+        ("a.mp4", "libx264", "yuv420p", False),
+    ],
+)
+def test_damaged_frames_are_missing_and_the_others_right(
+    tmp_path: Path, name: str, codec: str, pixels: str, intra: bool
+) -> None:
+    """A packet's bytes are overwritten: no wrong picture comes out, and every frame keeps its slot and time."""
+    path = tmp_path / name
+    write_video(path, codec, pixels, options=SAFE.get(codec))
+    truth = [frame.picture for frame in open_video(path).read()]
+    with av.open(str(path)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    content = bytearray(path.read_bytes())
+    start, size = content.find(packets[4]), len(packets[4])
+    content[start + size // 4 : start + size] = bytes(size - size // 4)
+    path.write_bytes(content)
+    frames = list(open_video(path).read())
+    assert len(frames) == FRAMES
+    np.testing.assert_allclose([frame.time for frame in frames], 0.01 * np.arange(FRAMES), atol=1e-4)
+    gone = [number for number, frame in enumerate(frames) if frame.picture is None]
+    assert gone
+    assert gone == [4] if intra else set(gone) <= set(range(1, 7))
+    for frame, picture in zip(frames, truth, strict=True):
+        if frame.picture is not None:
+            np.testing.assert_array_equal(frame.picture, picture)
+
+
+def test_dropped_frames_and_uneven_times_are_honoured(tmp_path: Path) -> None:
+    path = tmp_path / "a.mkv"
+    stamps = [0, 10, 20, 50, 60, 71, 80]
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream("ffv1", rate=100)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "gray"
+        stream.codec_context.time_base = Fraction(1, 1000)
+        for number, stamp in enumerate(stamps):
+            frame = av.VideoFrame.from_ndarray(ramp(number), format="gray")
+            frame.pts, frame.time_base = stamp, Fraction(1, 1000)
+            output.mux(stream.encode(frame))
+        output.mux(stream.encode())
+    reading = open_video(path).read()
+    np.testing.assert_allclose([frame.time for frame in reading], 1e-3 * np.array(stamps), atol=1e-4)
+    assert any("1 gaps" in note for note in reading.notes)
+
+
+def test_a_false_rate_is_noted(tmp_path: Path) -> None:
+    """A container that announces another rate than its time stamps keep."""
+    path = tmp_path / "a.mkv"
+    write_video(path, "ffv1", "gray", rate=50)
+    video = replace(open_video(path), fps=30.0, frames=40)
+    reading = video.read()
+    assert len(list(reading)) == FRAMES
+    assert any("30 frames/s" in note and "50" in note for note in reading.notes)
+    assert any("announces 40 frames and holds 12" in note for note in reading.notes)
+
+
+def test_sixteen_bit_pictures(tmp_path: Path) -> None:
+    """Twelve bits in a 16-bit PNG."""
+    folder = tmp_path / "run"
+    folder.mkdir()
+    for number in range(2):
+        cv2.imwrite(str(folder / f"{number}.png"), (ramp(number).astype(np.uint16) * 16 + 5))
+    for number, frame in enumerate(open_video(folder).read()):
+        np.testing.assert_allclose(frame.picture, ramp(number) + 5 / 16)
+
+
+def test_a_reader_that_stops_early_leaves_no_thread(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.mkv", "ffv1", "gray")
+    before = threading.active_count()
+    frames = iter(open_video(tmp_path / "a.mkv").read())
+    next(frames)
+    frames.close()  # type: ignore[attr-defined]
+    assert threading.active_count() == before
 
 
 def camera() -> OrthographicCamera:

@@ -1,0 +1,104 @@
+"""The disc fit against a plain one, against the noise limit, and its uncertainty."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from tracking.artificial import Scene, draw, expose
+from tracking.dots import Dots, fit_dots, start_of
+
+SIDE = 64
+
+
+def filmed(
+    ellipse: tuple[float, ...], scene: Scene, seed: int = 0, smear: tuple[float, float] = (0.0, 0.0)
+) -> np.ndarray:
+    random = np.random.default_rng(seed)
+    return expose(draw(scene, np.array([ellipse]), random, np.array([smear])), scene, random)
+
+
+def fitted(image: np.ndarray, x: float, y: float, radius: float) -> Dots:
+    shape = np.array([1 / radius, 0.0, 1 / radius])
+    return fit_dots(image, start_of(x, y, shape, -120.0, 170.0)[None])
+
+
+def plain_level(p: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """The model in plain words: a bell-shaped edge across |A (x - c)| = 1, under light that falls off evenly."""
+    A = np.array([[p[2], p[3]], [p[3], p[4]]])
+    W = np.array([[p[5], p[6]], [p[6], p[7]]])
+    off = np.stack([x - p[0], y - p[1]], axis=-1)
+    image = off @ A
+    r = np.linalg.norm(image, axis=-1) + 1e-12
+    slope = image / r[..., None] @ A
+    z = np.clip((1 - r) / np.sqrt(np.einsum("...i,ij,...j->...", slope, W, slope)), -4, 4)
+    fine = np.linspace(-4, 4, 4001)
+    bell = (1 - fine**2 / 16) ** 8
+    step = np.interp(z, fine, np.cumsum(bell) / bell.sum())
+    return (p[9] + p[8] * step) * (1 + p[10] * off[..., 0] + p[11] * off[..., 1])
+
+
+def test_the_fast_fit_is_the_plain_one() -> None:
+    """The same model through scipy, over the same pixels' neighbourhood: centres agree far below the noise."""
+    scene = Scene(size=(SIDE, SIDE), noise=2.0, slope=0.2)
+    image = filmed((31.3, 32.8, 8.0, 6.5, 0.5), scene)
+    dots = fitted(image, 31.0, 33.0, 7.0)
+    y, x = np.mgrid[14:52, 14:50].astype(float)
+    start = dots.parameters[0] * np.array([1, 1, 1.05, 1, 0.95, 1.2, 1, 0.9, 1.02, 1, 1, 1]) + 1e-4
+    plain = least_squares(lambda p: (plain_level(p, x, y) - image[14:52, 14:50]).ravel(), start, x_scale="jac")
+    np.testing.assert_allclose(plain.x[:2], dots.centre[0], atol=6e-3)
+    np.testing.assert_allclose(plain.x[2:5], dots.parameters[0, 2:5], atol=6e-4)
+    assert plain.x[8] == pytest.approx(dots.contrast[0], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("radius", "noise", "smear", "limit"),
+    [(3.0, 4.0, (0.0, 0.0), 1.15), (8.0, 8.0, (0.0, 0.0), 1.15), (20.0, 4.0, (0.0, 0.0), 1.15),
+     (8.0, 4.0, (3.0, 2.0), 1.15), (8.0, 4.0, (0.0, 16.0), 1.4)],
+)  # fmt: skip
+def test_centres_reach_the_noise_limit(radius: float, noise: float, smear: tuple[float, float], limit: float) -> None:
+    """Against the Cramer-Rao bound with all but the place known, and sigma says what the error is."""
+    scene = Scene(size=(int(4 * radius) + 40, int(4 * radius) + 40), noise=noise)
+    x, y = 2 * radius + 20.3, 2 * radius + 19.6
+    ellipse = np.array([[x, y, radius, radius, 0.0]])
+    random = np.random.default_rng(5)
+    slopes = []
+    for axis in range(2):
+        moved = [ellipse.copy(), ellipse.copy()]
+        moved[0][0, axis] += 0.05
+        moved[1][0, axis] -= 0.05
+        up, down = (draw(scene, item, random, np.array([smear])) for item in moved)
+        slopes.append((((up - down) / 0.1) ** 2).sum())
+    bound = np.sqrt(noise**2 + 1 / 12) / np.sqrt(np.array(slopes))
+    clean = draw(scene, ellipse, random, np.array([smear]))
+    errors, sigmas = [], []
+    for _ in range(200):
+        away = random.uniform(-1, 1, 2)
+        dots = fitted(expose(clean, scene, random), x + away[0], y + away[1], 0.95 * radius)
+        errors.append(dots.centre[0] - (x, y))
+        sigmas.append(dots.sigma[0])
+    rms = np.sqrt((np.array(errors) ** 2).mean(axis=0))
+    assert np.sqrt((rms**2).mean()) < limit * np.sqrt((bound**2).mean())
+    assert (np.abs(errors) < sigmas).mean() == pytest.approx(0.68, abs=0.07)
+
+
+def test_a_highlight_does_not_pull() -> None:
+    """A bright spot over the outline, and a stripe beside the dot."""
+    scene = Scene(size=(SIDE, SIDE), noise=2.0)
+    for seed in range(5):
+        image = filmed((31.3, 32.8, 8.0, 8.0, 0.0), scene, seed)
+        y, x = np.mgrid[:SIDE, :SIDE]
+        image[np.hypot(x - 38.5, y - 30.0) < 2.6] = 250
+        image[14:19, 20:50] = 240
+        dots = fitted(image, 31.0, 33.0, 8.0)
+        assert np.abs(dots.centre[0] - (31.3, 32.8)).max() < 0.05
+        assert dots.used[0] > 0.8
+
+
+def test_pictures_of_more_bits_say_more() -> None:
+    """The same clean dot in 8 bits and as floating-point levels."""
+    scene = Scene(size=(SIDE, SIDE), noise=0.0)
+    clean = draw(scene, np.array([[31.3, 32.8, 8.0, 8.0, 0.0]]), np.random.default_rng(0))
+    coarse = fitted(np.rint(clean).astype(np.uint8), 31.0, 33.0, 8.0)
+    fine = fitted(clean.astype(np.float32), 31.0, 33.0, 8.0)
+    assert np.abs(fine.centre[0] - (31.3, 32.8)).max() < 1e-3
+    assert fine.sigma[0, 0] <= coarse.sigma[0, 0]

@@ -1,0 +1,51 @@
+import numpy as np
+import pytest
+
+from tracking.shape import Pattern, recognise
+
+
+def grid(columns: int = 9, rows: int = 3) -> np.ndarray:
+    x, y = np.meshgrid(40 + 30.0 * np.arange(columns), 80 + 30.0 * np.arange(rows))
+    return np.stack([x, y], axis=-1).reshape(-1, 2)
+
+
+def bent(rest: np.ndarray, angle: float) -> np.ndarray:
+    """Sections stay straight and turn evenly, by `angle` at the far end."""
+    length = np.ptp(rest[:, 0])
+    s = (rest[:, 0] - rest[:, 0].min()) / length
+    turn = angle * s
+    fine = np.linspace(0, 1, 500)
+    line = np.cumsum(np.stack([np.cos(angle * fine), np.sin(angle * fine)], axis=1), axis=0) * length / 500
+    middle = np.stack([np.interp(s, fine, line[:, k]) for k in range(2)], axis=1)
+    across = rest[:, 1] - rest[:, 1].mean()
+    return middle + across[:, None] * np.stack([-np.sin(turn), np.cos(turn)], axis=1) + [60.0, 300.0]
+
+
+@pytest.mark.parametrize("angle", [0.35, -0.35])
+def test_moves_of_more_than_a_spacing(angle: float, random: np.random.Generator) -> None:
+    """Nothing is known of the motion, and the tip jumps by more than a spacing."""
+    before, after = bent(grid(), 0.1), bent(grid(), 0.1 + angle)
+    assert np.linalg.norm(after - before, axis=1).max() > 38
+    mixed = random.permutation(27)
+    match = recognise(Pattern.of(before), before, before, np.zeros(27), after[mixed], 2.2, 0.3)
+    np.testing.assert_array_equal(mixed[match], np.arange(27))
+
+
+def test_hidden_dots_and_false_ones(random: np.random.Generator) -> None:
+    before, after = bent(grid(), 0.0), bent(grid(), 0.25)
+    shown = np.delete(np.arange(27), [3, 4, 12, 13, 21])
+    dots = np.concatenate([after[shown], [[150.0, 200.0], [300.0, 420.0]]])
+    match = recognise(Pattern.of(before), before, before, np.zeros(27), dots, 2.2, 0.3)
+    np.testing.assert_array_equal(np.flatnonzero(match < 0), [3, 4, 12, 13, 21])
+    np.testing.assert_array_equal(shown[match[match >= 0]], np.flatnonzero(match >= 0))
+
+
+def test_markers_out_of_sight_ride_along() -> None:
+    """On an affinely moved body their places are exact but for the pull towards the whole body's map."""
+    rest = grid()
+    matrix = np.array([[0.9, -0.4], [0.35, 1.05]])
+    moved = rest @ matrix.T + [10.0, -5.0]
+    known = np.ones(27, bool)
+    known[[0, 8, 14]] = False
+    carried = Pattern.of(rest).carried(np.where(known[:, None], moved, np.nan), known)
+    np.testing.assert_allclose(carried, moved, atol=0.6)
