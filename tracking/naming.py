@@ -54,6 +54,7 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
         markers = np.arange(len(layout.names))
     pixels = camera.undistort(dots)
     expected = camera.ideal(layout.positions[markers])
+    size = max(float(np.ptp(expected, axis=0).max()), 1.0)
     best: tuple[float, dict[int, int]] = (-np.inf, {})
     complete = min(len(dots), len(markers))
     for turn in TURNS:
@@ -61,7 +62,7 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
         for matches in _beginnings(expected, pixels, rotation):
             # The calibrated position decides between a layout and its shifted copy.
             away = np.mean([np.linalg.norm(pixels[d] - expected[m]) for m, d in matches.items()])
-            score = len(matches) - 0.3 * min(away / np.ptp(expected, axis=0).max(), 1.0)
+            score = len(matches) - 0.3 * min(away / size, 1.0)
             if score > best[0]:
                 best = (score, matches)
         if len(best[1]) == complete:

@@ -119,7 +119,8 @@ def open_video(path: Path) -> Video:
                 raise InputError(f"expected a video in {path}, found no video stream; export it again")
             stream = container.streams.video[0]
             fps = float(stream.average_rate) if stream.average_rate else 0.0
-            frames, size = stream.frames, (stream.width, stream.height)
+            frames = stream.frames
+            size = (getattr(stream, "width", 0), getattr(stream, "height", 0))  # absent where no decoder is known
             if min(size) < 1:
                 raise InputError(f"expected a video in {path}, found {size[0]} x {size[1]} px; export it again")
             if _quarter_turns(container, stream) % 2:
