@@ -6,7 +6,7 @@ SHARED ?= ../shared
 # BLAS threads fight the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator clean
+.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking clean
 
 install: $(VENV)/installed
 
@@ -52,6 +52,10 @@ check-reference: install
 # Speed of forward and backward steps beside the authors', and how it grows with mesh, batch and threads.
 bench-simulator: install
 	$(BIN)/python tests/bench/simulator.py $(SHARED)/reference
+
+# Tracking and calibration on footage made fresh (SEED=number for the same again), beside trackpy and OpenCV.
+bench-tracking: install
+	$(BIN)/python tests/bench/tracker.py $(if $(SEED),--seed $(SEED)) $(if $(wildcard $(SHARED)/real/clamped_beam),--real $(SHARED)/real/clamped_beam)
 
 clean:
 	rm -rf build $(VENV)

@@ -10,7 +10,7 @@ from scipy.interpolate import CubicSpline
 Array = NDArray[Any]
 
 MISSING, MEASURED, FILLED = 0, 1, 2
-MODES = 8  # of the body's motion that a gap is filled from
+MODES = 12  # of the body's motion that a gap is filled from
 FEWEST_FRAMES = 12  # seen, before a marker is said to move as others do
 WIDEST = 400  # frames on either side of a gap that are learned from
 
@@ -67,18 +67,30 @@ def _as_the_others(
     if len(taught) < FEWEST_FRAMES:
         return None
     inputs = position[np.ix_(taught, others)].reshape(len(taught), -1)
-    mean, target_mean = inputs.mean(0), position[taught, marker].mean(0)
+    mean = inputs.mean(0)
     _, size, modes = np.linalg.svd(inputs - mean, full_matrices=False)
     count = min(MODES, len(taught) // 3, int((size > 1e-6 * size[0]).sum()))
     basis = modes[:count].T
     amounts = (inputs - mean) @ basis
+    # Where the body was bent alike counts for more: how markers ride on it is not quite linear.
+    here = (position[np.ix_(gap, others)].reshape(len(gap), -1) - mean) @ basis
+    unlike = ((amounts - here.mean(0)) ** 2).sum(1) / (amounts**2).sum(1).mean()
+    weight = (1.0 / (0.05 + unlike))[:, None]
+    weight *= len(taught) / weight.sum()
     ridge = 1e-8 * size[0] ** 2 * np.eye(count)
-    gain = np.linalg.solve(amounts.T @ amounts + ridge, amounts.T @ (position[taught, marker] - target_mean))
+    target_mean = (weight * position[taught, marker]).mean(0)
+    shift = (weight * amounts).mean(0)
+    centred = amounts - shift
+    gain = np.linalg.solve(
+        centred.T @ (weight * centred) + ridge, centred.T @ (weight * (position[taught, marker] - target_mean))
+    )
 
     def predicted(frames: NDArray[np.int64]) -> Array:
-        return (position[np.ix_(frames, others)].reshape(len(frames), -1) - mean) @ basis @ gain + target_mean
+        own = (position[np.ix_(frames, others)].reshape(len(frames), -1) - mean) @ basis
+        return (own - shift) @ gain + target_mean
 
-    missed = np.sqrt(((predicted(taught) - position[taught, marker]) ** 2).sum(0) / max(len(taught) - count, 1))
+    squares = weight * (predicted(taught) - position[taught, marker]) ** 2
+    missed = np.sqrt(squares.sum(0) / max(len(taught) - count, 1))
     ends = np.array([gap[0] - 1, gap[-1] + 1])
     away = position[ends, marker] - predicted(ends)
     share = ((gap - ends[0]) / (ends[1] - ends[0]))[:, None]
