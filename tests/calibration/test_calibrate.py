@@ -1,5 +1,6 @@
 """`rafl-calibrate` on pictures."""
 
+import re
 from pathlib import Path
 
 import cv2
@@ -14,33 +15,30 @@ from calibration.rig import read_rig
 SCALE = 9.0  # px/mm
 
 
-def dot_grid_picture(tilt: np.ndarray, supersampling: int = 4) -> np.ndarray:
-    """A printed grid of 9 x 6 dots of 5 mm at 10 mm, turned by a rotation vector, seen from the front."""
+def board_picture(tilt: np.ndarray, kind: str = "dots", supersampling: int = 4) -> np.ndarray:
+    """9 x 6 dots of 5 mm at 10 mm, or a chessboard with as many inner corners, turned, seen from the front."""
     turned = SCALE * Rotation.from_rotvec(tilt).as_matrix()[:2, :2]
     size = (900, 640)
     u, v = np.meshgrid(*(np.arange(n * supersampling) / supersampling - 0.5 + 0.5 / supersampling for n in size))
     board = np.stack([u - 100.0, v - 90.0], axis=-1) @ np.linalg.inv(turned).T
     nearest = np.clip(np.rint(board / 10.0), 0, [8, 5]) * 10.0
     dark = np.linalg.norm(board - nearest, axis=-1) < 2.5
+    if kind == "squares":
+        inside = ((board > -10) & (board < [90, 60])).all(axis=-1)
+        dark = inside & (np.floor(board / 10.0).astype(int).sum(axis=-1) % 2 == 0)
     picture = np.where(dark, 30.0, 210.0)
     return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+
+
+TILTS = [[0, 0, 0], [0.4, 0, 0], [0, 0.45, 0], [0.3, 0.3, 0], [-0.3, 0.35, 0.05], [0.2, -0.4, 0], [-0.5, 0.1, 0]]
 
 
 @pytest.fixture
 def dot_grid(tmp_path: Path) -> Path:
     folder = tmp_path / "grid"
     folder.mkdir()
-    tilts = [
-        [0, 0, 0],
-        [0.4, 0, 0],
-        [0, 0.45, 0],
-        [0.3, 0.3, 0],
-        [-0.3, 0.35, 0.05],
-        [0.2, -0.4, 0],
-        [-0.5, 0.1, 0],
-    ]
-    for number, tilt in enumerate(tilts):
-        cv2.imwrite(str(folder / f"{number}.png"), dot_grid_picture(np.array(tilt)))
+    for number, tilt in enumerate(TILTS):
+        cv2.imwrite(str(folder / f"{number}.png"), board_picture(np.array(tilt)))
     (folder / "board.yaml").write_text(
         "format: rafl-board/1\npattern: {kind: dot-grid, dots: [9, 6], spacing_mm: 10}\n"
     )
@@ -56,6 +54,33 @@ def test_a_dot_grid_before_one_camera(dot_grid: Path, run: Run, tmp_path: Path) 
     assert camera.residual < 0.1
     # The first picture's board is the world: its first dot is the origin, at pixel (100, 90).
     assert camera.offset == pytest.approx((100.0, 90.0), abs=0.1)
+
+
+def test_a_chessboard_and_held_out_pictures(run: Run, tmp_path: Path) -> None:
+    """Solved from seven pictures, checked on two others; a calibration that does not fit shows in the check."""
+    for folder, tilts in (("made", TILTS), ("held", [[0.25, 0.2, 0.03], [-0.2, 0.3, 0.0]])):
+        (tmp_path / folder).mkdir()
+        for number, tilt in enumerate(tilts):
+            cv2.imwrite(str(tmp_path / folder / f"{number}.png"), board_picture(np.array(tilt), "squares"))
+        (tmp_path / folder / "board.yaml").write_text(
+            "format: rafl-board/1\npattern: {kind: chessboard, corners: [9, 6], square_mm: 10}\n"
+        )
+    result = run("rafl-calibrate", "made", "--out", "calib.yaml")
+    assert result.returncode == 0, result.stderr
+    text = (tmp_path / "calib.yaml").read_text()
+    (camera,) = read_rig(tmp_path / "calib.yaml").cameras.values()
+    assert camera.scale == pytest.approx((9000.0, 9000.0), rel=1e-3)
+    (tmp_path / "calib.yaml").write_text(text.replace("made:", "held:"))
+    result = run("rafl-calibrate", "held", "--check", "calib.yaml")
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "check-held.png").stat().st_size > 5000
+    good = [float(line.split("│")[4]) for line in result.stdout.splitlines() if "held/" in line]
+    assert max(good) < 0.2
+    wrong = re.sub(r"skew: .*", "skew: 0.3", text.replace("made:", "held:"))
+    (tmp_path / "calib.yaml").write_text(wrong)
+    result = run("rafl-calibrate", "held", "--check", "calib.yaml")
+    worse = [float(line.split("│")[4]) for line in result.stdout.splitlines() if "held/" in line]
+    assert min(worse) > 2 * max(good)
 
 
 def test_bad_input(dot_grid: Path, run: Run, tmp_path: Path) -> None:
