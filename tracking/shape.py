@@ -58,9 +58,10 @@ class Pattern:
             return result
         count = min(6, len(sources))
         nearest = cKDTree(self.rest[sources]).query(self.rest[unknown], count)[1].reshape(len(unknown), count)
-        matrix = np.eye(2)
-        if len(sources) >= 3:
-            matrix = _affine(self.rest[sources], position[sources], np.ones(len(sources)), np.eye(2))
+        # Known markers in one line say nothing across it but that the body turns with them.
+        even = np.ones(len(sources))
+        turned = _similarity(self.rest[sources], position[sources], even)
+        matrix = _affine(self.rest[sources], position[sources], even, turned)
         for marker, rows in zip(unknown, nearest, strict=True):
             around = sources[rows]
             weight = 1.0 / np.linalg.norm(self.rest[around] - self.rest[marker], axis=1)
@@ -69,6 +70,16 @@ class Pattern:
             offset = self.rest[marker] - share @ self.rest[around]
             result[marker] = share @ position[around] + local @ offset
         return result
+
+
+def _similarity(source: Array, target: Array, weight: Array) -> Array:
+    """The turn and scale that best take source to target (N, 2), as a matrix; none from a single point."""
+    share = weight / weight.sum()
+    a = (source - share @ source) @ [1.0, 1.0j]
+    b = (target - share @ target) @ [1.0, 1.0j]
+    size = float(share @ np.abs(a) ** 2)
+    z = (share * np.conj(a)) @ b / size if size > 1e-12 else 1.0
+    return np.array([[np.real(z), -np.imag(z)], [np.imag(z), np.real(z)]])
 
 
 def _affine(source: Array, target: Array, weight: Array, expected: Array) -> Array:
