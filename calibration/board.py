@@ -7,9 +7,10 @@ from typing import Annotated, Any, Literal
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import ConfigDict, Field, field_validator
+from pydantic import ConfigDict, Field, field_validator, model_validator
 from scipy.spatial import cKDTree
 
+from calibration.fields import Direction
 from groundwork import InputError, StrictModel, read_yaml
 
 Array = NDArray[Any]
@@ -22,15 +23,14 @@ class WorldPose(StrictModel):
     """Where the board stood in one picture: its origin and the directions of its axes."""
 
     origin_mm: tuple[float, float, float]
-    x_axis: tuple[float, float, float]
-    y_axis: tuple[float, float, float]
+    x_axis: Direction
+    y_axis: Direction
 
-    @field_validator("x_axis", "y_axis")
-    @classmethod
-    def _unit(cls, axis: tuple[float, float, float]) -> tuple[float, float, float]:
-        if abs(np.linalg.norm(axis) - 1.0) > 1e-6:
-            raise ValueError("expected a direction of length 1")
-        return axis
+    @model_validator(mode="after")
+    def _square(self) -> "WorldPose":
+        if not abs(np.dot(self.x_axis, self.y_axis)) < 1e-3:
+            raise ValueError("expected axes at a right angle")
+        return self
 
     @property
     def rotation(self) -> Array:
@@ -134,14 +134,7 @@ class Move(StrictModel):
 
     from_: str = Field(alias="from")
     to: str
-    along: tuple[float, float, float]
-
-    @field_validator("along")
-    @classmethod
-    def _unit(cls, axis: tuple[float, float, float]) -> tuple[float, float, float]:
-        if abs(np.linalg.norm(axis) - 1.0) > 1e-6:
-            raise ValueError("expected a direction of length 1")
-        return axis
+    along: Direction
 
 
 class BoardFile(StrictModel):
@@ -152,6 +145,15 @@ class BoardFile(StrictModel):
     world: dict[str, WorldPose] = Field(default_factory=dict)
     moved: list[Move] = Field(default_factory=list)
     simultaneous: bool = False
+
+    @field_validator("moved")
+    @classmethod
+    def _from_where_it_stood(cls, moves: list[Move]) -> list[Move]:
+        reached = [move.to for move in moves]
+        for move in moves:
+            if move.from_ in reached or reached.count(move.to) > 1:
+                raise ValueError(f"expected every move to start where no other ends, found {move.from_} to {move.to}")
+        return moves
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import Field, field_validator
 
 from calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane
+from calibration.fields import Direction, PositivePair
 from groundwork import StrictModel, read_yaml, write_text
 
 FORMAT = "rafl-calibration/1"
@@ -22,23 +23,10 @@ class Rig:
     cameras: dict[str, Camera]
 
 
-def _positive(value: tuple[float, float]) -> tuple[float, float]:
-    if min(value) <= 0:
-        raise ValueError("expected two positive numbers")
-    return value
-
-
 class _PlaneEntry(StrictModel):
-    normal: tuple[float, float, float]
+    normal: Direction
     offset_mm: float
     sigma_mm: float = Field(PLANE_SIGMA_MM, gt=0)
-
-    @field_validator("normal")
-    @classmethod
-    def _unit(cls, normal: tuple[float, float, float]) -> tuple[float, float, float]:
-        if abs(np.linalg.norm(normal) - 1.0) > 1e-3:
-            raise ValueError("expected a vector of length 1")
-        return normal
 
 
 class _Entry(StrictModel):
@@ -80,7 +68,7 @@ class _Entry(StrictModel):
 
 class _OrthographicEntry(_Entry):
     model: Literal["orthographic"]
-    pixels_per_mm: Annotated[tuple[float, float], AfterValidator(_positive)]
+    pixels_per_mm: PositivePair
     skew: float = 0.0
     offset_px: tuple[float, float]
     distortion: tuple[float, float] = (0.0, 0.0)
@@ -99,7 +87,7 @@ class _OrthographicEntry(_Entry):
 
 class _PinholeEntry(_Entry):
     model: Literal["pinhole"]
-    focal_px: Annotated[tuple[float, float], AfterValidator(_positive)]
+    focal_px: PositivePair
     centre_px: tuple[float, float]
     translation_mm: tuple[float, float, float]
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
