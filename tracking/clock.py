@@ -9,7 +9,7 @@ from scipy.optimize import minimize_scalar
 
 from calibration.rig import Rig
 from groundwork import InputError
-from tracking.reconstruct import CameraPixels, at_times, triangulate
+from tracking.reconstruct import CameraPixels, at_times, nearest_frames, triangulate
 from tracking.video import Video
 
 Array = NDArray[Any]
@@ -58,15 +58,10 @@ def common_clock(times: dict[str, Array]) -> Array:
     clock = next(iter(times.values()))
     step = float(np.median(np.diff(clock)))
     for time in times.values():
-        gap = np.abs(time[:, None] - clock[None]).min(axis=1) if len(clock) * len(time) < 4e6 else _gaps(time, clock)
+        gap = np.abs(time - clock[nearest_frames(clock, time)])
         inside = (time > clock[0]) & (time < clock[-1])
         clock = np.sort(np.concatenate([clock, time[inside & (gap > 0.7 * step)]]))
     return clock
-
-
-def _gaps(time: Array, clock: Array) -> Array:
-    after = np.clip(np.searchsorted(clock, time), 1, len(clock) - 1)
-    return np.minimum(np.abs(time - clock[after - 1]), np.abs(clock[after] - time))
 
 
 def delays(rig: Rig, pixels: dict[str, CameraPixels], times: dict[str, Array]) -> dict[str, float]:

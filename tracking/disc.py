@@ -1,4 +1,4 @@
-"""Fitting a soft-edged elliptical disc to a picture's pixels.
+"""A soft-edged elliptical disc in a picture: which pixels tell of it, and how they follow its parameters.
 
 The outline is |A (x - c)| = 1 with A symmetric. Across it the level changes as the running integral of a
 bell curve whose variance along the outline's normal n is n . W n: lens blur, the pixel's own width and the
@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 PARAMETERS = 12  # centre (2), A (3: xx, xy, yy), W (3: xx, xy, yy) [px^2], contrast, level, slopes of the light (2)
-QUALITY = 7  # converged; centre's variances by independent errors (2), by blocks (2); mean squared residual; share used
 LARGEST = 8192  # pixels a fit looks at
 CHUNK = 256  # pixels whose derivatives are held at a time, so that they stay in the nearest cache
 
@@ -28,12 +27,6 @@ WEIGHTED = J + 16 * CHUNK
 SCRATCH = WEIGHTED + CHUNK
 LEAST_BLUR, MOST_BLUR = 0.08, 40.0  # of W along any direction [px^2]
 REACH = 4.0  # half the bell curve's support, in standard deviations
-OUTLYING = 0.12  # of the contrast: a pixel farther off than this shows something else than the dot
-STRANGE = 0.25  # of the contrast: a level this far from what the start expects
-NEAR = 0.03  # px: the next step would be a hundred times smaller
-WORTHLESS = 1.0  # of a pixel's mean squared residual: a gain that says nothing more about the disc
-LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edge does not describe any more
-BLOCK = 4  # px: errors closer than this are not taken to be independent
 
 # The bell (1 - z^2 / 16)^8 on |z| < 4 is close to exp(-z^2 / 2) and integrates to an odd polynomial.
 _SERIES = np.array([comb(8, k) * (-1.0 / 16.0) ** k / (2 * k + 1) for k in range(9)])
@@ -50,7 +43,7 @@ FAST: dict[str, Any] = {
 
 
 @njit(**FAST)
-def _choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
+def choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
     """The pixels a fit looks at, relative to the rounded centre; returns how many.
 
     Where the disc's level or its surroundings' is flat every other pixel is enough.
@@ -94,7 +87,7 @@ def _choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-def]
+def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-def]
     """Derivatives of a chunk's pixels, from the `first`, by the parameters, and the residual.
 
     A disc that moves far while the shutter is open is a mean over `_instants`; p[5:8] are then the
@@ -199,7 +192,7 @@ def _instants(p):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _smear(p):  # type: ignore[no-untyped-def]
+def smear(p):  # type: ignore[no-untyped-def]
     """Exchanges W, of a long smear, for an edge and a way moved: a box of length m has variance m^2 / 12."""
     mean = 0.5 * (p[5] + p[7])
     spread = np.sqrt(0.25 * (p[5] - p[7]) ** 2 + p[6] * p[6])
@@ -208,320 +201,3 @@ def _smear(p):  # type: ignore[no-untyped-def]
     p[5] = max(mean - spread, LEAST_BLUR)
     p[6] = length * np.cos(angle)
     p[7] = length * np.sin(angle)
-
-
-@njit(**FAST)
-def _normal_equations(p, smeared, x0, y0, count, w, H):  # type: ignore[no-untyped-def]
-    """Fills H (13, 16), lower triangle: J W J^T; its last row ends in the weighted squared residual."""
-    H[:] = 0.0
-    for first in range(0, count, CHUNK):
-        some = min(CHUNK, count - first)
-        _linearise(p, smeared, x0, y0, first, some, w)
-        _add_products(first, some, w, H)
-
-
-@njit(**FAST)
-def _add_products(first, count, w, H):  # type: ignore[no-untyped-def]
-    count = min(count, CHUNK)
-    first = min(max(first, 0), LARGEST - CHUNK)
-    for i in range(PARAMETERS + 1):
-        row = J + i * CHUNK
-        for k in range(count):
-            w[WEIGHTED + k] = w[WEIGHT + first + k] * w[row + k]
-        for j in range(0, i + 1, 4):  # past the diagonal too: four sums at once are as fast as one
-            column = J + j * CHUNK
-            sum0 = np.float32(0.0)
-            sum1 = np.float32(0.0)
-            sum2 = np.float32(0.0)
-            sum3 = np.float32(0.0)
-            for k in range(count):
-                factor = w[WEIGHTED + k]
-                sum0 += factor * w[column + k]
-                sum1 += factor * w[column + CHUNK + k]
-                sum2 += factor * w[column + 2 * CHUNK + k]
-                sum3 += factor * w[column + 3 * CHUNK + k]
-            H[i, j] += sum0
-            H[i, j + 1] += sum1
-            H[i, j + 2] += sum2
-            H[i, j + 3] += sum3
-
-
-@njit(**FAST)
-def _factor(H, damping, L):  # type: ignore[no-untyped-def]
-    """L L^T = H + damping diag H; False where that is not positive definite."""
-    for i in range(PARAMETERS):
-        for j in range(i + 1):
-            total = H[i, j]
-            if i == j:
-                total += (damping + 1e-9) * H[i, i] + 1e-12
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    return True
-
-
-@njit(**FAST)
-def _substitute(L, x):  # type: ignore[no-untyped-def]
-    """x becomes (L L^T)^-1 x."""
-    for i in range(PARAMETERS):
-        total = x[i]
-        for k in range(i):
-            total -= L[i, k] * x[k]
-        x[i] = total / L[i, i]
-    for i in range(PARAMETERS - 1, -1, -1):
-        total = x[i]
-        for k in range(i + 1, PARAMETERS):
-            total -= L[k, i] * x[k]
-        x[i] = total / L[i, i]
-
-
-@njit(**FAST)
-def _keep_possible(p, smeared):  # type: ignore[no-untyped-def]
-    """Keeps W's variances within bounds and its off-diagonal below what makes it indefinite."""
-    p[5] = min(max(p[5], LEAST_BLUR), MOST_BLUR)
-    if smeared:
-        return
-    p[7] = min(max(p[7], LEAST_BLUR), MOST_BLUR)
-    most = 0.95 * np.sqrt(p[5] * p[7])
-    p[6] = min(max(p[6], -most), most)
-
-
-@njit(**FAST)
-def _reweight(count, w):  # type: ignore[no-untyped-def]
-    """Less weight to pixels far off, by the median of the residuals' size; returns the largest change."""
-    count = min(count, LARGEST)
-    for k in range(count):
-        w[SIZE + k] = abs(w[RESIDUAL + k])
-    scale = np.float32(1.4826) * np.median(w[SIZE : SIZE + count]) + np.float32(0.3)
-    change = np.float32(0.0)
-    for k in range(count):
-        z = w[RESIDUAL + k] / (np.float32(4.0) * scale)
-        new = np.float32(1.0) / (np.float32(1.0) + z * z * z * z)
-        change = max(change, abs(new - w[WEIGHT + k]))
-        w[WEIGHT + k] = new
-    return change
-
-
-@njit(**FAST)
-def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untyped-def]
-    """The last small step, by the factor at hand, and the centre's variances; fills quality.
-
-    Variances as independent errors of the residual's size give them, and as the scores summed over blocks
-    of pixels say: compression leaves errors that neighbours share. Returns the size of the step.
-    """
-    n = PARAMETERS
-    pull = np.zeros((2, n))  # rows of H^-1: how the centre follows each score
-    for axis in range(2):
-        pull[axis, axis] = 1.0
-        _substitute(L, pull[axis])
-    reach = 0
-    for k in range(count):
-        reach = max(reach, abs(int(w[X + k])), abs(int(w[Y + k])))
-    side = 2 * reach // BLOCK + 2
-    for k in range(count):
-        row, column = (int(w[Y + k]) + reach) // BLOCK, (int(w[X + k]) + reach) // BLOCK
-        w[BLOCK_OF + k] = row * side + column
-    blocks = np.zeros((2, side * side))
-    white = np.zeros(2)
-    score = np.zeros(n)
-    squares = 0.0
-    used = 0.0
-    for first in range(0, count, CHUNK):
-        some = min(CHUNK, count - first)
-        _linearise(p, smeared, x0, y0, first, some, w)
-        _add_influence(first, some, w, pull, white, blocks)
-        squares_here, used_here = _add_scores(first, some, w, score)
-        squares += squares_here
-        used += used_here
-    mean_square = squares / max(used - n, 1.0)
-    for axis in range(2):
-        shared = 0.0
-        for cell in range(side * side):
-            shared += blocks[axis, cell] ** 2
-        quality[1 + axis] = white[axis] * mean_square
-        quality[3 + axis] = shared
-    quality[5] = squares / max(used, 1.0)
-    quality[6] = used / count
-    _substitute(L, score)
-    for i in range(n):
-        p[i] += score[i]
-    _keep_possible(p, smeared)
-    return max(abs(score[0]), abs(score[1]))
-
-
-@njit(**FAST)
-def _add_scores(first, count, w, score):  # type: ignore[no-untyped-def]
-    count = min(count, CHUNK)
-    first = min(max(first, 0), LARGEST - CHUNK)
-    squares = np.float32(0.0)
-    used = np.float32(0.0)
-    for k in range(count):
-        w[WEIGHTED + k] = w[WEIGHT + first + k] * w[J + 12 * CHUNK + k]
-        squares += w[WEIGHTED + k] * w[J + 12 * CHUNK + k]
-        used += w[WEIGHT + first + k]
-    for i in range(PARAMETERS):
-        row = J + i * CHUNK
-        total = np.float32(0.0)
-        for k in range(count):
-            total += w[WEIGHTED + k] * w[row + k]
-        score[i] += total
-    return squares, used
-
-
-@njit(**FAST)
-def _add_influence(first, count, w, pull, white, blocks):  # type: ignore[no-untyped-def]
-    """Each pixel's weight in the centre, squared and summed, and times its residual summed by block."""
-    count = min(count, CHUNK)
-    first = min(max(first, 0), LARGEST - CHUNK)
-    for axis in range(2):
-        for k in range(count):
-            w[WEIGHTED + k] = np.float32(0.0)
-        for i in range(PARAMETERS):
-            factor = np.float32(pull[axis, i])
-            row = J + i * CHUNK
-            for k in range(count):
-                w[WEIGHTED + k] += factor * w[row + k]
-        total = np.float32(0.0)
-        for k in range(count):
-            w[WEIGHTED + k] *= w[WEIGHT + first + k]
-            total += w[WEIGHTED + k] * w[WEIGHTED + k]
-            w[WEIGHTED + k] *= w[J + 12 * CHUNK + k]
-        white[axis] += total
-        for k in range(count):
-            blocks[axis, int(w[BLOCK_OF + first + k])] += w[WEIGHTED + k]
-
-
-@njit(**FAST)
-def _minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-def]
-    """Levenberg and Marquardt's steps from p, which is filled with the result; False where they fail.
-
-    Ends within `NEAR` of the minimum; L then factors H there, or nearly.
-    """
-    n = PARAMETERS
-    trial = p.copy()
-    step = np.zeros(n)
-    damping = 1e-3
-    best = np.inf
-    for _ in range(40):
-        _normal_equations(trial, smeared, x0, y0, count, w, H)
-        cost = H[n, n]
-        if not cost < np.inf:
-            return False
-        if cost <= best * (1.0 + 1e-6):
-            best = cost
-            p[:] = trial
-            for i in range(n):
-                step[i] = H[n, i]
-            damping = max(0.1 * damping, 1e-7)
-            if not _factor(H, damping, L):
-                return False
-            _substitute(L, step)
-            gain = 0.0
-            for i in range(n):
-                gain += step[i] * H[n, i]
-        else:  # back, and less far
-            damping = max(30.0 * damping, 1e-3)
-            if damping > 1e4:
-                return False
-            step *= 0.2
-            gain = np.inf
-        trial[:] = p + step
-        _keep_possible(trial, smeared)
-        if max(abs(step[0]), abs(step[1])) < NEAR and gain * count < WORTHLESS * best:
-            p[:] = trial
-            if damping < 1e-4:
-                return True
-            _normal_equations(p, smeared, x0, y0, count, w, H)
-            return _factor(H, 0.0, L)
-    return False
-
-
-@njit(**FAST)
-def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
-    """Fit a disc from the start p (12), which is filled with the result, as is quality (QUALITY).
-
-    near (K, 3): centre and radius of other dots. w (SCRATCH), float32, is room to work in.
-    """
-    n = PARAMETERS
-    quality[:] = 0.0
-    H = np.empty((n + 1, n + 4))
-    L = np.empty((n, n))
-    smeared = False
-    away = 1.0 + 2.0 / np.sqrt(max(p[2] * p[4] - p[3] * p[3], 1e-12))
-    left, right, top, bottom = p[0] - away, p[0] + away, p[1] - away, p[1] + away
-    count = 0
-    x0 = 0
-    y0 = 0
-    for _ in range(4):  # the pixels are chosen anew where the disc has left those it began with
-        x0, y0 = int(np.rint(p[0])), int(np.rint(p[1]))
-        count = _choose_pixels(image, p, near, w)
-        if count < 3 * n:
-            return
-        strange = _distrust(p, smeared, x0, y0, count, w)
-        if not _minimise(p, smeared, x0, y0, count, w, H, L):
-            return
-        if not (left < p[0] < right and top < p[1] < bottom):
-            return
-        if abs(p[0] - x0) < 1.5 and abs(p[1] - y0) < 1.5:
-            break
-    spread = np.sqrt(0.25 * (p[5] - p[7]) ** 2 + p[6] * p[6])
-    if np.sqrt(24.0 * spread) > LONG_SMEAR / np.sqrt(p[2] * p[4] - p[3] * p[3]):
-        smeared = True
-        _smear(p)
-        if not _minimise(p, smeared, x0, y0, count, w, H, L):
-            return
-        _normal_equations(p, smeared, x0, y0, count, w, H)
-        if not _factor(H, 0.0, L):
-            return
-    if strange or _outlying(count, w) > OUTLYING * abs(p[8]):
-        for _ in range(6):
-            change = _reweight(count, w)
-            if not _minimise(p, smeared, x0, y0, count, w, H, L):
-                return
-            if change < 0.1:
-                break
-    for _ in range(3):
-        if _finish(p, smeared, x0, y0, count, w, L, quality) < 0.1 * NEAR:
-            break
-    if smeared:  # back to W, from which another fit may start
-        p[5], p[6], p[7] = p[5] + p[6] ** 2 / 12.0, p[6] * p[7] / 12.0, p[5] + p[7] ** 2 / 12.0
-    quality[0] = 1.0
-
-
-@njit(**FAST)
-def _distrust(p, smeared, x0, y0, count, w):  # type: ignore[no-untyped-def]
-    """First weights: little where, away from the outline, a level is far from the start's; True if any is.
-
-    Otherwise a highlight beside the dot could pass for its blurred edge.
-    """
-    scale = np.float32(STRANGE * abs(p[8]))
-    strange = 0
-    for first in range(0, count, CHUNK):
-        some = min(CHUNK, count - first)
-        _linearise(p, smeared, x0, y0, first, some, w)
-        for k in range(some):
-            weight = np.float32(1.0)
-            if abs(w[J + 8 * CHUNK + k] - np.float32(0.5)) > np.float32(0.4999):
-                z = w[J + 12 * CHUNK + k] / scale
-                weight = np.float32(1.0) / (np.float32(1.0) + z * z * z * z)
-            if weight < 0.3:
-                strange += 1
-            w[WEIGHT + first + k] = weight
-    if strange < 4:
-        for k in range(count):
-            w[WEIGHT + k] = np.float32(1.0)
-    return strange >= 4
-
-
-@njit(**FAST)
-def _outlying(count, w):  # type: ignore[no-untyped-def]
-    count = min(count, LARGEST)
-    largest = np.float32(0.0)
-    for k in range(count):
-        largest = max(largest, abs(w[RESIDUAL + k]))
-    return largest

@@ -9,7 +9,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tracking.disc import PARAMETERS, QUALITY, SCRATCH, fit_disc
+from tracking.disc import PARAMETERS, SCRATCH
+from tracking.fit import QUALITY, fit_disc
 
 Array = NDArray[Any]
 

@@ -43,7 +43,7 @@ def at_times(pixels: CameraPixels, own: Array, asked: Array) -> CameraPixels:
         asked: [s], (T).
     """
     step = float(np.median(np.diff(own)))
-    nearest = np.abs(asked[:, None] - own[None]).argmin(axis=1) if len(own) < 2000 else _nearest(own, asked)
+    nearest = nearest_frames(own, asked)
     same = np.abs(own[nearest] - asked) < SAME_FRAME * step
     pixel = np.where(same[:, None, None], pixels.pixel[nearest], np.nan)
     sigma = np.where(same[:, None, None], pixels.sigma[nearest], np.nan)
@@ -64,7 +64,8 @@ def at_times(pixels: CameraPixels, own: Array, asked: Array) -> CameraPixels:
     return CameraPixels(pixel, sigma)
 
 
-def _nearest(own: Array, asked: Array) -> NDArray[np.int64]:
+def nearest_frames(own: Array, asked: Array) -> NDArray[np.int64]:
+    """Of frames at times own (S >= 2), rising, the nearest to each time asked (T)."""
     after = np.clip(np.searchsorted(own, asked), 1, len(own) - 1)
     return after - (asked - own[after - 1] < own[after] - asked)
 

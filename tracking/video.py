@@ -203,7 +203,6 @@ def _file_frames(video: Video, notes: list[str]) -> Iterator[Frame]:
     path = video.path
     number = 0
     shown: list[float] = []
-    lost = 0
     try:
         with av.open(str(path)) as container:
             stream = container.streams.video[0]
@@ -229,18 +228,14 @@ def _file_frames(video: Video, notes: list[str]) -> Iterator[Frame]:
                 for frame in frames:
                     spoilt = frame.is_corrupt or (broken if frame.pts is None else frame.pts in slots.damaged)
                     if frame.pts is not None:
-                        missing = list(slots.up_to(frame.pts))
-                        lost += len(missing)
-                        yield from missing
+                        yield from slots.up_to(frame.pts)
                     time = np.nan if frame.pts is None else slots.time(frame.pts)
                     picture = None if spoilt else _grey(frame)
-                    lost += picture is None
                     shown.append(time)
                     yield Frame(time, picture)
                     number += 1
             if number:
                 missing = list(slots.up_to(None))
-                lost += len(missing)
                 number += len(missing)
                 yield from missing
     except (av.FFmpegError, OSError) as error:
