@@ -2,7 +2,7 @@
 
 import heapq
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -224,8 +224,10 @@ class Tracker:
 
     def _search(self, image: NDArray, expected: Array) -> Dots:
         """Every dot near the body, matched to the markers all at once."""
+        hidden = int(self.missing.min())
+        uncertain = 1.0 + 0.3 * min(hidden, 10)
         margin = (SEED_REACH + 1.0) * float(np.median(self.pattern.spacing)) + 2.0 * self.family.radius
-        margin *= 1.0 + 0.3 * min(int(self.missing.min()), 10)
+        margin *= uncertain
         low, high = expected.min(0) - margin, expected.max(0) + margin
         shape = np.median(self.parameters[:, 2:5], axis=0)
         level = float(np.median(self.parameters[:, 9]))
@@ -236,11 +238,10 @@ class Tracker:
         dots = fit_dots(image, np.array(starts).reshape(-1, PARAMETERS))
         dots = _apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
         speed = np.linalg.norm(expected - self.believed[-1], axis=1) / self.pattern.spacing
-        reach = SEED_REACH * (1.0 + 0.3 * min(int(self.missing.min()), 10))
         trusted = -speed - 0.2 * np.minimum(self.missing, 10)
-        hidden = int(self.missing.min())
         surprise = float(self.surprise.min())
         sureness = 0.0 if hidden else 1.0 / (1.0 + (2.0 * surprise) ** 2) if np.isfinite(surprise) else 0.3
+        reach = SEED_REACH * uncertain
         match = recognise(self.pattern, self.believed[-1], expected, trusted, dots.centre, reach, sureness)
         chosen = dots[np.maximum(match, 0)] if len(dots) else Dots.none(len(match))
         return _only(chosen, match >= 0)
@@ -275,8 +276,7 @@ class Tracker:
 
 def _only(dots: Dots, good: NDArray[np.bool_]) -> Dots:
     """The same dots, the others' sigma NaN."""
-    dots.sigma[~good] = np.nan
-    return dots
+    return replace(dots, sigma=np.where(good[:, None], dots.sigma, np.nan))
 
 
 def _apart(dots: Dots, nearest: float) -> Dots:

@@ -56,16 +56,14 @@ def write_overlay(
     shrink = min(1.0, WIDEST / max(video.size))
     width, height = (max(int(side * shrink) // 2 * 2, 2) for side in video.size)
     pixel = shown_pixels(tracks, name, camera) * shrink
-    offset = camera.time_offset
+    row_of = {number: row for row, number in reversed(list(enumerate(tracks.frame[name].tolist())))}
     with whole_file(path) as temporary, av.open(str(temporary), "w", format="mp4") as output:
         stream = output.add_stream("libx264", rate=Fraction(min(tracks.fps, 25.0)).limit_denominator(100))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for number, frame in enumerate(video.read()):
             tick()
-            row = number
-            if np.isfinite(frame.time) and "from the video" in tracks.settings:
-                row = int(np.abs(tracks.time - (frame.time - offset)).argmin())
-            if frame.picture is None or row >= len(tracks.time):
+            row = row_of.get(number)
+            if frame.picture is None or row is None:
                 continue
             small = cv2.resize(eight_bits(frame.picture), (width, height), interpolation=cv2.INTER_AREA)
             trails = pixel[max(row - TRAIL, 0) : row + 1]

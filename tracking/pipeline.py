@@ -16,7 +16,7 @@ from tracking.fill import MEASURED, fill_gaps
 from tracking.follow import FEWEST_MARKERS, PixelTracks, follow
 from tracking.layout import MarkerLayout
 from tracking.naming import name_by_layout, name_by_rows
-from tracking.reconstruct import CameraPixels, at_times, triangulate
+from tracking.reconstruct import CameraPixels, at_times, shown_frames, triangulate
 from tracking.tracks import Tracks, read_tracks
 from tracking.video import Video
 
@@ -92,6 +92,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         notes += [f"camera {camera}: clock {1e3 * delay:+.3f} ms by the motion" for camera, delay in ahead.items()]
     on_rig = {camera: time - ahead[camera] for camera, time in times.items()}
     clock = common_clock(on_rig)
+    frame = {camera: shown_frames(time, clock) for camera, time in on_rig.items()}
     pixels = {camera: at_times(item, on_rig[camera], clock) for camera, item in filmed.items()}
     position, sigma, residual = triangulate(rig, pixels)
     position, sigma, state = fill_gaps(position, sigma, clock, settings.fill)
@@ -111,7 +112,8 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         pixel={camera: item.pixel for camera, item in pixels.items()},
         residual=residual,
         pixel_sigma={camera: item.sigma for camera, item in pixels.items()},
-        damaged={camera: _on_clock(item.damaged, on_rig[camera], clock) for camera, item in followed.items()},
+        damaged={camera: item.damaged[frame[camera]] & (frame[camera] >= 0) for camera, item in followed.items()},
+        frame=frame,
         pictures={camera: item.pictures for camera, item in followed.items()},
         fps=float(1.0 / np.median(np.diff(clock))),
         calibration=rig_text(rig),
@@ -129,11 +131,6 @@ def _in_order(item: PixelTracks, names: list[str | None], order: list[str]) -> C
             pixel[:, order.index(name)] = item.pixel[:, dot]
             sigma[:, order.index(name)] = item.sigma[:, dot]
     return CameraPixels(pixel, sigma)
-
-
-def _on_clock(flags: NDArray[np.bool_], own: Array, clock: Array) -> NDArray[np.bool_]:
-    nearest = np.clip(np.searchsorted(own, clock - 0.5 * np.median(np.diff(own))), 0, len(own) - 1)
-    return flags[nearest]
 
 
 def _ranges(frames: NDArray[np.int64]) -> str:

@@ -70,6 +70,12 @@ def nearest_frames(own: Array, asked: Array) -> NDArray[np.int64]:
     return after - (asked - own[after - 1] < own[after] - asked)
 
 
+def shown_frames(own: Array, asked: Array) -> NDArray[np.int64]:
+    """Of frames at times own (S >= 2), the one that shows each time asked (T); -1 where none is within half a frame."""
+    nearest = nearest_frames(own, asked)
+    return np.where(np.abs(own[nearest] - asked) <= 0.5 * np.median(np.diff(own)), nearest, -1)
+
+
 def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array, dict[str, Array]]:
     """Weighted least squares over the cameras that see a marker; its plane where only one does.
 

@@ -88,9 +88,10 @@ def _camera(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
     pictures = tracks.pictures[name]
     first = min(pictures)
     sigma = tracks.pixel_sigma[name]
+    row_of = {number: row for row, number in reversed(list(enumerate(tracks.frame[name].tolist())))}
     worst = []
-    for number in sorted(set(pictures) - {first}):
-        row = min(number, len(sigma) - 1)
+    for number in sorted(set(pictures) & set(row_of) - {first}):
+        row = row_of[number]
         seen = np.isfinite(sigma[row, :, 0])
         worst.append(
             {
@@ -103,7 +104,7 @@ def _camera(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
         )
     return {
         "name": name,
-        "first": _picture(pictures[first], tracks, pixel, min(first, len(sigma) - 1)),
+        "first": _picture(pictures[first], tracks, pixel, row_of.get(first, 0)),
         "first_number": first,
         "histogram": _histogram(tracks, name),
         "worst": worst,

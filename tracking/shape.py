@@ -95,48 +95,19 @@ def _affine(source: Array, target: Array, weight: Array, expected: Array) -> Arr
 @njit(cache=True, nogil=True)
 def _predicted(marker, shape, linear, spacing, neighbours, dots, match):  # type: ignore[no-untyped-def]
     """Where a marker's matched neighbours put it: their affine map, drawn towards the expected one."""
-    sw = 0.0
-    sx = 0.0
-    sy = 0.0
-    tx = 0.0
-    ty = 0.0
+    sw = sx = sy = tx = ty = 0.0  # sums over neighbours, places taken from the marker's own
+    mxx = mxy = myy = nxx = nxy = nyx = nyy = 0.0
     for k in range(neighbours.shape[1]):
         other = neighbours[marker, k]
         if other >= 0 and match[other] >= 0:
-            g = 1.0 / (np.hypot(shape[other, 0] - shape[marker, 0], shape[other, 1] - shape[marker, 1]) + 1e-9)
+            ux, uy = shape[other, 0] - shape[marker, 0], shape[other, 1] - shape[marker, 1]
+            vx, vy = dots[match[other], 0] - shape[marker, 0], dots[match[other], 1] - shape[marker, 1]
+            g = 1.0 / (np.hypot(ux, uy) + 1e-9)
             sw += g
-            sx += g * shape[other, 0]
-            sy += g * shape[other, 1]
-            tx += g * dots[match[other], 0]
-            ty += g * dots[match[other], 1]
-    if sw == 0.0:  # apart from all that is matched: from the nearest matched marker
-        nearest = np.inf
-        chosen = -1
-        for other in range(shape.shape[0]):
-            if match[other] >= 0:
-                gap = np.hypot(shape[other, 0] - shape[marker, 0], shape[other, 1] - shape[marker, 1])
-                if gap < nearest:
-                    nearest = gap
-                    chosen = other
-        sw, sx, sy = 1.0, shape[chosen, 0], shape[chosen, 1]
-        tx, ty = dots[match[chosen], 0], dots[match[chosen], 1]
-    sx /= sw
-    sy /= sw
-    tx /= sw
-    ty /= sw
-    mxx = 0.0
-    mxy = 0.0
-    myy = 0.0
-    nxx = 0.0
-    nxy = 0.0
-    nyx = 0.0
-    nyy = 0.0
-    for k in range(neighbours.shape[1]):
-        other = neighbours[marker, k]
-        if other >= 0 and match[other] >= 0:
-            g = 1.0 / (np.hypot(shape[other, 0] - shape[marker, 0], shape[other, 1] - shape[marker, 1]) + 1e-9) / sw
-            ux, uy = shape[other, 0] - sx, shape[other, 1] - sy
-            vx, vy = dots[match[other], 0] - tx, dots[match[other], 1] - ty
+            sx += g * ux
+            sy += g * uy
+            tx += g * vx
+            ty += g * vy
             mxx += g * ux * ux
             mxy += g * ux * uy
             myy += g * uy * uy
@@ -144,6 +115,20 @@ def _predicted(marker, shape, linear, spacing, neighbours, dots, match):  # type
             nxy += g * vx * uy
             nyx += g * vy * ux
             nyy += g * vy * uy
+    if sw == 0.0:  # apart from all that is matched: from the nearest matched marker
+        nearest = np.inf
+        for other in range(shape.shape[0]):
+            if match[other] >= 0:
+                ux, uy = shape[other, 0] - shape[marker, 0], shape[other, 1] - shape[marker, 1]
+                gap = np.hypot(ux, uy)
+                if gap < nearest:
+                    nearest = gap
+                    sx, sy = ux, uy
+                    tx, ty = dots[match[other], 0] - shape[marker, 0], dots[match[other], 1] - shape[marker, 1]
+    else:
+        sx, sy, tx, ty = sx / sw, sy / sw, tx / sw, ty / sw
+        mxx, mxy, myy = mxx / sw - sx * sx, mxy / sw - sx * sy, myy / sw - sy * sy
+        nxx, nxy, nyx, nyy = nxx / sw - tx * sx, nxy / sw - tx * sy, nyx / sw - ty * sx, nyy / sw - ty * sy
     ridge = STIFFNESS * (mxx + myy) + 1e-3 * spacing[marker] ** 2
     nxx += ridge * linear[marker, 0, 0]
     nxy += ridge * linear[marker, 0, 1]
@@ -152,10 +137,9 @@ def _predicted(marker, shape, linear, spacing, neighbours, dots, match):  # type
     mxx += ridge
     myy += ridge
     inverse = 1.0 / (mxx * myy - mxy * mxy)
-    ux, uy = shape[marker, 0] - sx, shape[marker, 1] - sy
-    px = (myy * ux - mxy * uy) * inverse
-    py = (mxx * uy - mxy * ux) * inverse
-    return tx + nxx * px + nxy * py, ty + nyx * px + nyy * py
+    px = (mxy * sy - myy * sx) * inverse
+    py = (mxy * sx - mxx * sy) * inverse
+    return shape[marker, 0] + tx + nxx * px + nxy * py, shape[marker, 1] + ty + nyx * px + nyy * py
 
 
 @njit(cache=True, nogil=True)

@@ -13,7 +13,7 @@ from groundwork import VERSION, InputError, check_format, require_file, whole_fi
 Array = NDArray[Any]
 
 FORMAT = "rafl-tracks/1"
-OF_CAMERA = ("pixel", "residual", "pixel_sigma", "damaged")
+OF_CAMERA = ("pixel", "residual", "pixel_sigma", "damaged", "frame")
 
 
 @dataclass(frozen=True)
@@ -30,6 +30,7 @@ class Tracks:
         residual: reprojection residual by camera, (T, M) [px].
         pixel_sigma: one standard deviation of each coordinate by camera, (T, M, 2) [px].
         damaged: frames by camera that could not be decoded, (T).
+        frame: by camera, the number in its video of the frame shown at each time, -1 for none, (T).
         pictures: by camera, the first frame and the worst, by number, as JPEG.
         fps: frames per second.
         calibration: text of calib.yaml; empty for positions from elsewhere.
@@ -48,6 +49,7 @@ class Tracks:
     residual: dict[str, Array]
     pixel_sigma: dict[str, Array]
     damaged: dict[str, NDArray[np.bool_]]
+    frame: dict[str, NDArray[np.int64]]
     pictures: dict[str, dict[int, bytes]]
     fps: float
     calibration: str
@@ -109,6 +111,7 @@ def read_tracks(path: Path) -> Tracks:
                 residual=of_camera["residual"],
                 pixel_sigma=of_camera["pixel_sigma"],
                 damaged=of_camera["damaged"],
+                frame=of_camera["frame"],
                 pictures=pictures,
                 fps=float(file.attrs["fps"]),
                 calibration=str(file.attrs["calibration"]),

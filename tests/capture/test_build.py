@@ -107,8 +107,9 @@ def test_tracks_are_taken_as_they_are_unless_they_cannot_be(
         time, sigma = 0.01 * np.arange(FRAMES), np.full_like(position, 1e-5)
         state = whole.astype(np.uint8)
         tracks = Tracks(
-            small_specimen.layout.names, time, position, sigma, state, {}, {}, {}, {}, {}, 100.0, "", {"v.mp4": "0"}, ""
-        )
+            small_specimen.layout.names, time, position, sigma, state,
+            {}, {}, {}, {}, {}, {}, 100.0, "", {"v.mp4": "0"}, "",
+        )  # fmt: skip
         write_tracks(tmp_path / "q0.h5", tracks)
 
     write(moving)

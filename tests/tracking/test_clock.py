@@ -8,7 +8,7 @@ from calibration.camera import OrthographicCamera
 from calibration.rig import Rig
 from groundwork import InputError
 from tracking.clock import camera_times, common_clock, delays
-from tracking.reconstruct import CameraPixels
+from tracking.reconstruct import CameraPixels, shown_frames
 from tracking.video import Video
 
 SIDE = OrthographicCamera(
@@ -62,6 +62,12 @@ def test_frames_one_camera_dropped_are_kept_from_the_other() -> None:
     whole, holed = TIME, np.delete(TIME, [30, 31])
     np.testing.assert_allclose(common_clock({"a": holed, "b": whole}), whole)
     np.testing.assert_allclose(common_clock({"a": whole, "b": holed + 1e-4}), whole)
+
+
+def test_which_frame_shows_which_time() -> None:
+    holed = np.delete(TIME, [30, 31])
+    shown = shown_frames(holed, common_clock({"a": holed, "b": TIME}))
+    np.testing.assert_array_equal(shown, [*range(30), -1, -1, *range(30, len(holed))])
 
 
 def test_times_that_do_not_rise_or_rates_that_differ_are_refused() -> None:

@@ -19,7 +19,7 @@ def tracks(random: np.random.Generator) -> Tracks:
     position[2, 1] = np.nan
     sigma = np.where(np.isfinite(position), 2e-5, np.nan)
     time = 0.01 * np.arange(6)
-    return Tracks(("L1", "L2", "tip"), time, position, sigma, state, {}, {}, {}, {}, {}, 100.0, "", {}, "")
+    return Tracks(("L1", "L2", "tip"), time, position, sigma, state, {}, {}, {}, {}, {}, {}, 100.0, "", {}, "")
 
 
 def test_csv(tracks: Tracks, tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ def tracks(random: np.random.Generator) -> Tracks:
         residual={"left": np.zeros(shape)},
         pixel_sigma={"left": np.full((*shape, 2), 0.02)},
         damaged={"left": np.zeros(7, dtype=bool)},
+        frame={"left": np.array([0, 1, 2, -1, 3, 4, 5])},
         pictures={"left": {0: b"first", 5: b"worst"}},
         fps=100.0,
         calibration="format: rafl-calibration/1",

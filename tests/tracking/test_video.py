@@ -1,3 +1,4 @@
+import struct
 import threading
 from dataclasses import replace
 from fractions import Fraction
@@ -164,6 +165,23 @@ def test_a_false_rate_is_noted(tmp_path: Path) -> None:
     assert len(list(reading)) == FRAMES
     assert any("30 frames/s" in note and "50" in note for note in reading.notes)
     assert any("announces 40 frames and holds 12" in note for note in reading.notes)
+
+
+def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path) -> None:
+    """As telephones write it: the pictures lie on their side, the file's display matrix says a quarter turn."""
+    path = tmp_path / "a.mp4"
+    write_video(path, "libx264", "yuv420p", options={"crf": "4"})
+    content = bytearray(path.read_bytes())
+    matrix = content.index(b"tkhd") + 44  # after version, times, number, duration, layer and volume
+    one = 0x10000
+    content[matrix : matrix + 36] = struct.pack(">9i", 0, one, 0, -one, 0, 0, 64 * one, 0, 0x40000000)
+    path.write_bytes(content)
+    video = open_video(path)
+    assert video.size == (64, 96)
+    picture = next(iter(video.read())).picture
+    assert picture is not None
+    clockwise = np.rot90(ramp(0), -1)
+    assert np.corrcoef(picture.ravel(), clockwise.ravel())[0, 1] > 0.99
 
 
 def test_sixteen_bit_pictures(tmp_path: Path) -> None:
