@@ -18,7 +18,7 @@ from calibration.bundle import NEARNESS, Adjusted, Scene, adjust
 from calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane, centre_and_half_diagonal
 from calibration.rig import PLANE_SIGMA_MM, Rig
 from calibration.starts import Problem, rotation_starts, scene_of, start_from
-from calibration.views import check_views
+from calibration.views import check_views, farther_edge
 from groundwork import InputError
 
 Array = NDArray[Any]
@@ -176,11 +176,8 @@ def _sign(problem: Problem, found: Adjusted, camera: int) -> tuple[int, str, flo
     board = problem.boards.index(problem.owner(view))
     turn = Rotation.from_rotvec(found.unknowns.cameras[camera, 3:6]).as_matrix()
     turn = turn @ Rotation.from_rotvec(found.unknowns.boards[board, :3]).as_matrix()
-    depth = turn[2, :2]
-    along = turn[:2, :2] @ depth
-    axis = int(abs(along[1]) > abs(along[0]))
-    tilt = float(np.arcsin(np.clip(np.linalg.norm(depth), 0.0, 1.0)))
-    return int(np.sign(along[axis])), view.name, tilt, ("right", "lower")[axis]
+    sign, tilt, edge = farther_edge(turn)
+    return sign, view.name, tilt, edge
 
 
 def _solution(

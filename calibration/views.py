@@ -110,6 +110,19 @@ def check_views(camera: str, views: list[View]) -> None:
         )
 
 
+def farther_edge(turn: Array) -> tuple[int, float, str]:
+    """Which way a flat board turned so (3, 3) tilts in the picture.
+
+    Returns:
+        +1 where the edge named is farther, -1 where it is nearer; the tilt [rad]; the edge, right or lower.
+    """
+    depth = turn[2, :2]
+    along = turn[:2, :2] @ depth
+    axis = int(abs(along[1]) > abs(along[0]))
+    tilt = float(np.arcsin(np.clip(np.linalg.norm(depth), 0.0, 1.0)))
+    return int(np.sign(along[axis])), tilt, ("right", "lower")[axis]
+
+
 def _different(directions: list[float]) -> int:
     """How many of these (modulo half a turn) are `APART` from one another, at most."""
     most = 0

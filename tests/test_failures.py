@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from calibration.camera import OrthographicCamera, Plane
 from calibration.rig import Rig, write_rig
-from tracking.cli import app
+from tracking.cli import track_app
 
 SIZE = (200, 160)
 
@@ -109,7 +109,7 @@ def test_mutated_files(lab: Path, name: str, random: np.random.Generator) -> Non
             del mutated[place : place + int(random.integers(1, 60))]
         path.write_bytes(mutated)
         out = f"out{number}"
-        result = CliRunner().invoke(app, [*command(lab, out), "--specimen", str(lab / "specimen.yaml")])
+        result = CliRunner().invoke(track_app, [*command(lab, out), "--specimen", str(lab / "specimen.yaml")])
         assert result.exception is None or isinstance(result.exception, SystemExit), "".join(
             traceback.format_exception(result.exception)
         )
@@ -135,6 +135,6 @@ def test_temporary_files_of_killed_programs_go(lab: Path) -> None:
     living = out / f".take0-{os.uname().nodename}-{os.getpid()}-abcdefgh.h5"
     dead.write_bytes(b"half")
     living.write_bytes(b"half")
-    assert CliRunner().invoke(app, command(lab)).exit_code == 0
+    assert CliRunner().invoke(track_app, command(lab)).exit_code == 0
     assert not dead.exists()
     assert living.exists()
