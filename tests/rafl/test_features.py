@@ -102,6 +102,32 @@ def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], ran
     assert float((q.grad * dq + v.grad * dv).sum()) == pytest.approx(float(slope), rel=1e-5)
 
 
+@pytest.mark.parametrize("still", [True, False])
+def test_compiled_field_is_the_plain_one(still: bool, random: np.random.Generator) -> None:
+    """Forces and every derivative of several bent states, at rest too, on cells of different shapes."""
+    torch.manual_seed(1)
+    model = ResidualField()
+    model.scale.copy_(torch.linspace(0.5, 20.0, 34))
+    cells = np.ones((3, 2, 2), dtype=bool)
+    cells[2, 1] = False
+    mesh = HexMesh.from_grid(cells, (0.01, 0.012, 0.008))
+    simulator = Simulator(mesh, Material(), mesh.face_nodes("x-min"))
+    moves = 0.0 if still else random.normal(0, 2e-3, (3, *mesh.vertices.shape))
+    q = torch.tensor(mesh.vertices + moves + np.zeros((3, 1, 1)))
+    v = torch.tensor(random.normal(0, 0.3, q.shape) * (not still))
+    c = torch.tensor(random.normal(size=q.shape))
+    results = []
+    for force in (model.on(simulator), model.plainly_on(simulator)):
+        leaves = [q.clone().requires_grad_(), v.clone().requires_grad_()]
+        value = force(*leaves, 0 * q)
+        results.append([value, *torch.autograd.grad((value * c).sum(), [*leaves, *model.parameters()])])
+    for number, (compiled, plain) in enumerate(zip(*results, strict=True)):
+        assert torch.isfinite(compiled).all()
+        if still and number == 1:
+            continue  # where all stretches are equal, which of them is the smallest has no derivative
+        torch.testing.assert_close(compiled, plain, rtol=1e-8, atol=1e-11 * float(plain.detach().abs().max()))
+
+
 def test_weights_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
     model, simulator = field
     q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
