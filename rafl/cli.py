@@ -13,7 +13,7 @@ from groundwork import InputError, command_line, progress, user_command, write_t
 from rafl.dataset import Dataset, read_dataset
 from rafl.errors import SimulationError
 from rafl.evaluation import Comparison, compare, error_table, held_out_errors, split_table
-from rafl.fit import fit_residual_field, training_recordings
+from rafl.fit import fit_residual_field, training_items
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
 from rafl.sysid import identify_material
@@ -49,6 +49,13 @@ def fit(
     patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping (rafl).")] = 20,
     frames: Annotated[int, typer.Option(min=0, help="Leading frames to train on (0: all).")] = 0,
     seed: Annotated[int, typer.Option(help="Of weights and order (rafl).")] = 0,
+    batch: Annotated[int, typer.Option(min=1, help="Recordings an update (rafl); torchrun shares them out.")] = 2,
+    force_penalty: Annotated[float, typer.Option(min=0.0, help="On squared residual forces [m2/N2] (rafl).")] = 1e-8,
+    warm_start: Annotated[
+        int, typer.Option(min=0, help="Passes over the equations of motion first, where every vertex is seen (rafl).")
+    ] = 12,
+    start: Annotated[Path | None, typer.Option("--from", help="Run to fine-tune (rafl).")] = None,
+    by_sigma: Annotated[bool, typer.Option("--by-sigma", help="Markers count by their uncertainty.")] = False,
     resume: Annotated[bool, typer.Option(help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Train on the `train` recordings, watch the `val` ones, keep the best.
@@ -62,17 +69,22 @@ def fit(
     run = out or Path("runs") / f"{loaded[0].name}-{method.value}"
     settings = Settings(
         method.value, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
-        weight_decay, patience, frames, seed,
+        weight_decay, patience, frames, seed, batch, force_penalty, warm_start if start is None else 0,
+        str(start.resolve()) if start else "", by_sigma,
     )  # fmt: skip
-    training_recordings(loaded)  # refused before anything is written
+    if start is not None:
+        load_model(start)
+    training_items(loaded)  # refused before anything is written
     _open_run(run, settings, resume)
     with progress() as bar:
         task = bar.add_task("epoch", total=epochs)
 
         def report(row: dict[str, float]) -> None:
-            bar.update(task, completed=row["epoch"])
-            values = ", ".join(f"{key} {value:.5g}" for key, value in row.items() if key != "epoch")
-            bar.console.print(f"epoch {row['epoch']:3.0f}: {values}", highlight=False, soft_wrap=True)
+            kind = "epoch" if "epoch" in row else "warm_start"
+            bar.update(task, completed=row.get("epoch", 0))
+            values = ", ".join(f"{key} {value:.5g}" for key, value in row.items() if key != kind)
+            label = kind.replace("_", " ")
+            bar.console.print(f"{label} {row[kind]:3.0f}: {values}", highlight=False, soft_wrap=True)
 
         try:
             method_of = fit_residual_field if method is Method.rafl else identify_material

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +11,9 @@ import torch
 from groundwork import InputError
 from rafl.dataset import Dataset, Trajectory
 from rafl.errors import SimulationError
-from rafl.features import GaussPoints, features
+from rafl.field_force import FieldPoints
 from rafl.objective import Recordings, frame_errors, training_loss
+from rafl.processes import Processes, processes
 from rafl.residual import ResidualField
 from rafl.rollout import rollout
 from rafl.run import (
@@ -25,8 +26,12 @@ from rafl.run import (
     save_tensors,
     write_history,
 )
+from rafl.warm_start import warm_start
 
 GRADIENT_LIMIT = 10.0  # Adam's step does not depend on the size; a diverging rollout's must not enter its memory
+
+LAST_RATE = 0.02  # of the first learning rate
+CHECKPOINT = "checkpoint.pt"
 
 Report = Callable[[dict[str, float]], None]
 
@@ -43,23 +48,43 @@ def shortened(dataset: Dataset, frames: int) -> Dataset:
     return replace(dataset, trajectories={name: cut(item) for name, item in dataset.trajectories.items()})
 
 
-def training_recordings(datasets: list[Dataset]) -> tuple[list[Recordings], list[Recordings]]:
-    """Training recordings one by one, validation recordings one batch a dataset.
+@dataclass(frozen=True)
+class Item:
+    """One recording to train on."""
 
-    Without a validation split the training recordings validate.
+    dataset: Dataset
+    name: str
+
+
+def training_items(datasets: list[Dataset]) -> list[Item]:
+    """The training recordings of some datasets.
 
     Raises:
-        InputError: no recording to train on.
+        InputError: none.
     """
-    train = [Recordings.of(dataset, [name]) for dataset in datasets for name in dataset.split("train")]
-    if not train:
+    items = [Item(dataset, name) for dataset in datasets for name in dataset.split("train")]
+    if not items:
         where = ", ".join(dataset.name for dataset in datasets)
         raise InputError(
             f"expected recordings with split `train` in {where}, found none; set the split column of "
             "recordings.csv and run rafl-capture again"
         )
-    validate = [Recordings.of(dataset, names) for dataset in datasets if (names := dataset.split("val"))]
-    return train, validate or train
+    return items
+
+
+def batches(items: list[Item], by_sigma: bool = False) -> list[Recordings]:
+    """Recordings simulated together: those of each dataset."""
+    names: dict[int, list[str]] = {}
+    owners = {id(item.dataset): item.dataset for item in items}
+    for item in items:
+        names.setdefault(id(item.dataset), []).append(item.name)
+    return [Recordings.of(owners[key], chosen, by_sigma) for key, chosen in names.items()]
+
+
+def validation_batches(datasets: list[Dataset]) -> list[Recordings]:
+    """The validation recordings; without any the training recordings validate."""
+    chosen = [Item(dataset, name) for dataset in datasets for name in dataset.split("val")]
+    return batches(chosen or training_items(datasets))
 
 
 def mean_error(sets: list[Recordings], model: FittedModel) -> float:
@@ -77,10 +102,11 @@ def mean_error(sets: list[Recordings], model: FittedModel) -> float:
 
 
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
-    """Train a `ResidualField`; one Adam step per recording, the best on the validation set is kept.
+    """Train a `ResidualField` by Adam, one step per batch of recordings; the best on the validation set is kept.
 
     After every epoch `checkpoint.pt`, `model.pt` and `history.csv` in `run` are up to date; called again
-    with the same settings it goes on from there and ends with the weights of an uninterrupted run.
+    with the same settings it goes on from there and ends with the weights of an uninterrupted run. Under
+    torchrun every batch is shared out to the processes, and process 0 writes.
 
     Args:
         datasets: one or more specimens.
@@ -92,75 +118,133 @@ def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, r
         InputError: nothing to train on, or a checkpoint that is not of this run.
         SimulationError: a rollout failed; names recording and step.
     """
-    train, validate = training_recordings([shortened(dataset, settings.frames) for dataset in datasets])
-    torch.manual_seed(settings.seed)
-    field = ResidualField()
-    field.scale_to([_sample_features(recordings) for recordings in train])
-    model = FittedModel("rafl", field=field)
-    optimiser = torch.optim.Adam(field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-        optimiser, settings.epochs, eta_min=0.02 * settings.learning_rate
-    )
-    shuffle = torch.Generator().manual_seed(settings.seed)
-    history: list[dict[str, float]] = []
-    checkpoint = run / "checkpoint.pt"
-    if checkpoint.exists():
-        saved = load_tensors(checkpoint, "a checkpoint of this run")
-        field.load_state_dict(saved["field"])
-        optimiser.load_state_dict(saved["optimiser"])
-        schedule.load_state_dict(saved["schedule"])
-        shuffle.set_state(saved["shuffle"])
-        history = saved["history"]
-    else:
-        first = mean_error(validate, model)
-        history.append({"epoch": 0, "loss": math.nan, "validation_mm": 1e3 * first, "learning_rate": 0.0})
-        save_model(run, model)
-        report(history[-1])
-    while history[-1]["epoch"] < settings.epochs and not _stale(history, settings.patience):
-        losses = []
-        for index in torch.randperm(len(train), generator=shuffle):
-            recordings = train[index]
-            optimiser.zero_grad()
-            simulated, forces = recordings.simulate(field.on(recordings.dataset.simulator))
-            loss = training_loss(recordings, simulated, forces)
-            loss.backward()
-            size = torch.nn.utils.clip_grad_norm_(field.parameters(), GRADIENT_LIMIT)
-            if not torch.isfinite(size):
-                raise SimulationError(
-                    f"the gradient of recording {recordings.names[0]} is not finite in epoch "
-                    f"{len(history)}; lower the learning rate"
-                )
-            optimiser.step()
-            losses.append(loss.item())
-        rate = float(schedule.get_last_lr()[0])
-        schedule.step()
-        error = 1e3 * mean_error(validate, model)
-        best = min(row["validation_mm"] for row in history)
-        history.append(
-            {
-                "epoch": history[-1]["epoch"] + 1,
-                "loss": float(np.mean(losses)),
-                "validation_mm": error,
-                "learning_rate": rate,
-            }
+    cut = [shortened(dataset, settings.frames) for dataset in datasets]
+    with processes() as group:
+        return _Training(cut, settings, run, report, group).go()
+
+
+class _Training:
+    """One process's part of a training."""
+
+    def __init__(
+        self, datasets: list[Dataset], settings: Settings, run: Path, report: Report, group: Processes
+    ) -> None:
+        self.settings, self.run, self.group = settings, run, group
+        self.report: Report = report if group.first else lambda row: None
+        self.items, self.validate = training_items(datasets), validation_batches(datasets)
+        self.history: list[dict[str, float]] = []
+        torch.manual_seed(settings.seed)
+        self.field = self._first_field(datasets)
+        self.optimiser = torch.optim.Adam(
+            self.field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
-        if error < best:
-            save_model(run, model)
-        save_tensors(
-            checkpoint,
-            {
+        self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+            self.optimiser, settings.epochs, eta_min=LAST_RATE * settings.learning_rate
+        )
+        self.shuffle = torch.Generator().manual_seed(settings.seed)
+
+    def _first_field(self, datasets: list[Dataset]) -> ResidualField:
+        if self.settings.start:
+            field = load_model(Path(self.settings.start)).field
+            if field is None:
+                raise InputError(f"expected a run of method rafl in {self.settings.start} to go on from, found another")
+            return field
+        field = ResidualField()
+        if not (self.run / CHECKPOINT).exists():
+            field.scale_to([_sample_features(dataset) for dataset in datasets if dataset.split("train")])
+            warm_start(
+                field, datasets, self.settings.warm_start, self.settings.seed,
+                lambda: 1e3 * mean_error(self.validate, FittedModel("rafl", field=field)), self.report,
+            )  # fmt: skip
+        return field
+
+    def go(self) -> FittedModel:
+        """Train to the end."""
+        model = FittedModel("rafl", field=self.field)
+        if (self.run / CHECKPOINT).exists():
+            self._resume()
+        else:
+            self.group.wait()  # nobody looks for the checkpoint any more
+            first = self.group.agree(1e3 * mean_error(self.validate, model))
+            self.history.append({"epoch": 0, "loss": math.nan, "validation_mm": first, "learning_rate": 0.0})
+            self._save(best=True)
+        while self.history[-1]["epoch"] < self.settings.epochs and not _stale(self.history, self.settings.patience):
+            rate = float(self.schedule.get_last_lr()[0])
+            loss = self._epoch()
+            self.schedule.step()
+            error = self.group.agree(1e3 * mean_error(self.validate, model))
+            best = error < min(row["validation_mm"] for row in self.history)
+            epoch = self.history[-1]["epoch"] + 1
+            self.history.append({"epoch": epoch, "loss": loss, "validation_mm": error, "learning_rate": rate})
+            self._save(best)
+        self.group.wait()
+        return load_model(self.run)
+
+    def _epoch(self) -> float:
+        """Mean loss of one pass over the recordings."""
+        losses = []
+        order = torch.randperm(len(self.items), generator=self.shuffle).tolist()
+        for first in range(0, len(order), self.settings.batch):
+            together = [self.items[k] for k in order[first : first + self.settings.batch]]
+            losses.append(self._update(together))
+        return float(
+            np.average(
+                losses,
+                weights=[
+                    min(self.settings.batch, len(order) - first) for first in range(0, len(order), self.settings.batch)
+                ],
+            )
+        )
+
+    def _update(self, together: list[Item]) -> float:
+        """One step of the optimiser; the batch's mean loss."""
+        self.optimiser.zero_grad()
+        mean = torch.zeros(1, dtype=torch.float64)
+        for recordings in batches(self.group.mine(together), self.settings.by_sigma):
+            force = self.field.on(recordings.dataset.simulator, torch.float32)
+            simulated, forces = recordings.simulate(force)
+            loss = training_loss(recordings, simulated, forces, self.settings.force_penalty)
+            loss = loss * len(recordings.names) / len(together)
+            loss.backward()
+            mean += loss.detach()
+        gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.field.parameters()]
+        self.group.add_up([*gradients, mean])
+        for parameter, gradient in zip(self.field.parameters(), gradients, strict=True):
+            parameter.grad = gradient
+        size = torch.nn.utils.clip_grad_norm_(self.field.parameters(), GRADIENT_LIMIT)
+        if not torch.isfinite(size):
+            names = ", ".join(item.name for item in together)
+            raise SimulationError(
+                f"the gradient of recordings {names} is not finite in epoch {len(self.history)}; "
+                "lower the learning rate"
+            )
+        self.optimiser.step()
+        return mean.item()
+
+    def _resume(self) -> None:
+        saved = load_tensors(self.run / CHECKPOINT, "a checkpoint of this run")
+        self.field.load_state_dict(saved["field"])
+        self.optimiser.load_state_dict(saved["optimiser"])
+        self.schedule.load_state_dict(saved["schedule"])
+        self.shuffle.set_state(saved["shuffle"])
+        self.history = saved["history"]
+
+    def _save(self, best: bool) -> None:
+        if self.group.first:
+            if best:
+                save_model(self.run, FittedModel("rafl", field=self.field))
+            content: dict[str, object] = {
                 "format": FORMAT,
                 "method": "rafl",
-                "field": field.state_dict(),
-                "optimiser": optimiser.state_dict(),
-                "schedule": schedule.state_dict(),
-                "shuffle": shuffle.get_state(),
-                "history": history,
-            },
-        )
-        write_history(run, history)
-        report(history[-1])
-    return load_model(run)
+                "field": self.field.state_dict(),
+                "optimiser": self.optimiser.state_dict(),
+                "schedule": self.schedule.state_dict(),
+                "shuffle": self.shuffle.get_state(),
+                "history": self.history,
+            }
+            save_tensors(self.run / CHECKPOINT, content)
+            write_history(self.run, self.history)
+        self.report(self.history[-1])
 
 
 def _stale(history: list[dict[str, float]], patience: int) -> bool:
@@ -168,14 +252,12 @@ def _stale(history: list[dict[str, float]], patience: int) -> bool:
     return len(errors) - 1 - int(np.argmin(errors)) >= patience
 
 
-def _sample_features(recordings: Recordings) -> torch.Tensor:
+def _sample_features(dataset: Dataset) -> torch.Tensor:
     """Features along the untouched simulator's motion, every tenth step."""
-    simulator = recordings.dataset.simulator
+    simulator, names = dataset.simulator, dataset.split("train")
+    steps = max(len(dataset.trajectories[name].time) for name in names) - 1
     with torch.no_grad():
-        start = recordings.dataset.start(recordings.names)
-        q, _ = rollout(simulator, start, len(recordings.markers) - 1)
-        v = torch.diff(q, dim=0, prepend=q[:1]) / simulator.time_step
-        points = GaussPoints.of(simulator.mesh, simulator.material.density)
-        gravity = torch.tensor(simulator.gravity, dtype=torch.float64)
-        chosen = slice(0, None, 10)
-        return features(q[chosen].flatten(0, 1), v[chosen].flatten(0, 1), points, gravity)[0]
+        q, _ = rollout(simulator, dataset.start(names), steps)
+    v = torch.diff(q, dim=0, prepend=q[:1]) / simulator.time_step
+    states = (np.ascontiguousarray(x[::10].flatten(0, 1).numpy()) for x in (q, v))
+    return torch.from_numpy(FieldPoints.of(simulator).features(*states)[0]).T

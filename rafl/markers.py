@@ -33,7 +33,21 @@ class Markers:
 
     def positions(self, q: Tensor) -> Tensor:
         """Marker positions [m], (..., M, 3), at mesh positions q (..., N, 3); differentiable."""
-        corners = q[..., torch.from_numpy(self.quad), :]  # (..., M, 4, 3)
+        return self._from_corners(q[..., torch.from_numpy(self.quad), :])
+
+    def slopes(self, q: Tensor) -> Tensor:
+        """Derivatives of the markers' positions by their quads' corners, (..., M, 3, 4, 3)."""
+        corners = q[..., torch.from_numpy(self.quad), :]
+        columns = []
+        for corner in range(4):
+            for axis in range(3):
+                direction = torch.zeros_like(corners)
+                direction[..., corner, axis] = 1.0
+                columns.append(torch.func.jvp(self._from_corners, (corners,), (direction,))[1])
+        return torch.stack(columns, dim=-1).unflatten(-1, (4, 3))
+
+    def _from_corners(self, corners: Tensor) -> Tensor:
+        """Positions (..., M, 3) from the quads' corners (..., M, 4, 3)."""
         along, across = torch.from_numpy(self._tangent_weights)
         point = (corners * torch.from_numpy(self.weights)[:, :, None]).sum(-2)
         normal = torch.linalg.cross((corners * along[:, :, None]).sum(-2), (corners * across[:, :, None]).sum(-2))

@@ -12,7 +12,7 @@ from rafl.parameters import Parameters
 from rafl.rollout import ResidualForce, rollout
 
 LOSS_SCALE = 1e3
-FORCE_PENALTY = 1e-4  # lambda_1 of the paper's objective
+LEAST_SIGMA = 0.2  # of the median: nothing counts more than 25 times the usual
 
 
 @dataclass(frozen=True)
@@ -24,25 +24,31 @@ class Recordings:
         names: of the recordings, (B).
         markers: [m], (T, B, M, 3), zero where not valid.
         valid: 1 where a marker was seen, (T, B, M).
+        weight: of each coordinate in the loss: `valid`, or by sigma, (T, B, M, 3).
     """
 
     dataset: Dataset
     names: list[str]
     markers: Tensor
     valid: Tensor
+    weight: Tensor
 
     @classmethod
-    def of(cls, dataset: Dataset, names: list[str]) -> "Recordings":
-        """Stack the named recordings."""
+    def of(cls, dataset: Dataset, names: list[str], by_sigma: bool = False) -> "Recordings":
+        """Stack the named recordings; `by_sigma` weighs coordinates by their variance, one in the median."""
         items = [dataset.trajectories[name] for name in names]
         frames = max(len(item.time) for item in items)
         count = len(dataset.markers.names)
         markers = np.zeros((frames, len(items), count, 3))
         valid = np.zeros((frames, len(items), count))
+        weight = np.zeros((frames, len(items), count, 3))
+        usual = _usual_sigma(dataset) if by_sigma else 0.0
         for b, item in enumerate(items):
             markers[: len(item.time), b] = np.where(item.valid[..., None], item.markers, 0.0)
             valid[: len(item.time), b] = item.valid
-        return cls(dataset, names, torch.from_numpy(markers), torch.from_numpy(valid))
+            own = (usual / np.maximum(item.sigma, LEAST_SIGMA * usual)) ** 2 if by_sigma else 1.0
+            weight[: len(item.time), b] = item.valid[..., None] * own
+        return cls(dataset, names, *(torch.from_numpy(array) for array in (markers, valid, weight)))
 
     def simulate(
         self, residual: ResidualForce | None = None, parameters: Parameters | None = None
@@ -58,16 +64,21 @@ class Recordings:
         return self.dataset.markers.positions(positions), forces
 
 
-def training_loss(recordings: Recordings, simulated: Tensor, forces: Tensor) -> Tensor:
-    """Per recording 1e3 times the mean over steps of sum |x - x_bar|^2 + 1e-4 sum f^2, averaged.
+def _usual_sigma(dataset: Dataset) -> float:
+    sigma = np.concatenate([item.sigma[item.valid].ravel() for item in dataset.trajectories.values()])
+    return float(np.median(sigma[np.isfinite(sigma)]))
+
+
+def training_loss(recordings: Recordings, simulated: Tensor, forces: Tensor, force_penalty: float = 0.0) -> Tensor:
+    """Per recording 1e3 times the mean over steps of sum |x - x_bar|^2 + force_penalty sum f^2, averaged.
 
     The paper's objective; frames where a marker was not seen do not count.
     """
     steps = recordings.valid[1:].amax(-1).sum(0).clamp_min(1.0)  # (B)
-    gap = ((simulated - recordings.markers)[1:] ** 2).sum(-1) * recordings.valid[1:]
-    total = gap.sum((0, 2))
+    gap = (simulated - recordings.markers)[1:] ** 2 * recordings.weight[1:]
+    total = gap.sum((0, 2, 3))
     if forces.numel():
-        total = total + FORCE_PENALTY * (forces**2).sum((0, 2, 3))
+        total = total + force_penalty * (forces**2).sum((0, 2, 3))
     return LOSS_SCALE * (total / steps).mean()
 
 

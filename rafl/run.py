@@ -8,6 +8,7 @@ import torch
 import yaml
 
 from groundwork import InputError, check_format, require_file, whole_file, write_text
+from rafl.global_residual import GlobalResidual
 from rafl.parameters import Parameters
 from rafl.residual import ResidualField
 from rafl.rollout import ResidualForce
@@ -21,18 +22,25 @@ class FittedModel:
     """What a fit leaves: a residual field, or identified material parameters.
 
     Attributes:
-        method: `rafl` or `sysid`.
+        method: one of `rafl.methods.METHODS`.
         field: the residual acceleration field, for `rafl`.
-        material: identified values by their name in `rafl.parameters.Parameters`, for `sysid`.
+        material: identified values by their name in `rafl.parameters.Parameters`, for `sysid` and its kin.
+        network: from the whole state to nodal forces, for `srl`.
     """
 
     method: str
     field: ResidualField | None = None
     material: dict[str, float] | None = None
+    network: GlobalResidual | None = None
 
     def residual(self, simulator: Simulator) -> ResidualForce | None:
-        """The residual force on a specimen, if this model has one."""
-        return self.field.on(simulator) if self.field is not None else None
+        """The residual force on a specimen, if this model has one.
+
+        Raises:
+            InputError: a mesh that the model cannot act on.
+        """
+        residual = self.field or self.network
+        return residual.on(simulator) if residual is not None else None
 
     def parameters(self, simulator: Simulator) -> Parameters:
         """What to simulate a specimen with: its own material, or the identified one."""
@@ -52,6 +60,11 @@ class Settings:
         patience: epochs without a better validation error before training stops.
         frames: leading frames of each recording used for training (all when 0).
         seed: of the initial weights and the order of recordings.
+        batch: recordings an update.
+        force_penalty: the paper's lambda_1 [m^2/N^2].
+        warm_start: passes over the equations of motion before the first simulation.
+        start: run folder whose model training goes on from; empty for new weights.
+        by_sigma: whether markers count by their uncertainty.
     """
 
     method: str
@@ -62,6 +75,11 @@ class Settings:
     patience: int
     frames: int
     seed: int
+    batch: int = 1
+    force_penalty: float = 1e-8
+    warm_start: int = 0
+    start: str = ""
+    by_sigma: bool = False
 
 
 def write_settings(run: Path, settings: Settings) -> None:
@@ -116,6 +134,8 @@ def save_model(run: Path, model: FittedModel) -> None:
         content["field"] = model.field.state_dict()
     if model.material is not None:
         content["material"] = dict(model.material)
+    if model.network is not None:
+        content |= {"nodes": model.network.nodes, "network": model.network.state_dict()}
     save_tensors(run / "model.pt", content)
 
 
@@ -126,10 +146,14 @@ def load_model(run: Path) -> FittedModel:
         InputError: missing, damaged, or written by a newer version.
     """
     content = load_tensors(run / "model.pt", "a fitted model (written by rafl-fit)")
-    if content["method"] == "sysid":
+    if "material" in content:
         if not isinstance(content["material"], dict):
             raise InputError(f"expected identified values by name in {run / 'model.pt'}, found a list; fit again")
-        return FittedModel("sysid", material=content["material"])
+        return FittedModel(content["method"], material=content["material"])
+    if "network" in content:
+        network = GlobalResidual(content["nodes"])
+        network.load_state_dict(content["network"])
+        return FittedModel("srl", network=network)
     field = ResidualField()
     field.load_state_dict(content["field"])
     return FittedModel("rafl", field=field)

@@ -8,7 +8,7 @@ from scipy.optimize import minimize
 
 from rafl.dataset import Dataset
 from rafl.errors import SimulationError
-from rafl.fit import Report, mean_error, shortened, training_recordings
+from rafl.fit import Report, batches, mean_error, shortened, training_items, validation_batches
 from rafl.objective import training_loss
 from rafl.run import FittedModel, Settings, read_history, save_model, write_history
 
@@ -34,7 +34,9 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         InputError: no recording to train on.
         SimulationError: the assumed material itself cannot be simulated.
     """
-    train, validate = training_recordings([shortened(dataset, settings.frames) for dataset in datasets])
+    cut = [shortened(dataset, settings.frames) for dataset in datasets]
+    train, validate = batches(training_items(cut), settings.by_sigma), validation_batches(cut)
+    count = sum(len(recordings.names) for recordings in train)
     history = read_history(run)
     losses: dict[bytes, float] = {}
 
@@ -45,7 +47,7 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         try:
             for recordings in train:
                 simulated, forces = recordings.simulate(parameters=recordings.dataset.simulator.parameters(**values))
-                total = total + training_loss(recordings, simulated, forces) / len(train)
+                total = total + training_loss(recordings, simulated, forces) * len(recordings.names) / count
         except SimulationError:
             if not losses:
                 raise

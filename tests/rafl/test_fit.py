@@ -7,7 +7,7 @@ import torch
 from groundwork import InputError
 from rafl import fit
 from rafl.dataset import Dataset
-from rafl.fit import fit_residual_field, mean_error, training_recordings
+from rafl.fit import fit_residual_field, mean_error, training_items
 from rafl.objective import Recordings
 from rafl.run import FittedModel, Settings, load_model
 from rafl.sysid import identify_material
@@ -82,7 +82,7 @@ def test_an_interrupted_identification_goes_on(dataset: Dataset, tmp_path: Path)
 def test_nothing_to_train_on_is_refused(dataset: Dataset) -> None:
     items = {name: replace(item, split="test") for name, item in dataset.trajectories.items()}
     with pytest.raises(InputError, match="split `train`"):
-        training_recordings([replace(dataset, trajectories=items)])
+        training_items([replace(dataset, trajectories=items)])
 
 
 def test_a_strangers_pickle_is_not_run(tmp_path: Path) -> None:

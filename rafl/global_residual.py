@@ -1,0 +1,77 @@
+"""The supervised baseline's network: from the whole state to a force on every vertex (paper, SRL baseline)."""
+
+import torch
+from torch import Tensor, nn
+
+from groundwork import InputError
+from rafl.rollout import ResidualForce
+from rafl.simulator import Simulator
+
+WIDTH, BLOCKS, LAYERS = 512, 5, 3
+
+
+class _Block(nn.Module):
+    """Layers of one width whose sum is added to what came in."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for _ in range(LAYERS):
+            layers += [nn.Linear(width, width), nn.LayerNorm(width), nn.ELU()]
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x + self.layers(x)
+
+
+class GlobalResidual(nn.Module):
+    """From positions and velocities of all N vertices to a force on each; of no use on another mesh.
+
+    Inputs and outputs are normalised by their means and standard deviations over the training states.
+    """
+
+    state_mean: Tensor
+    state_size: Tensor
+    force_mean: Tensor
+    force_size: Tensor
+
+    def __init__(self, nodes: int) -> None:
+        super().__init__()
+        self.nodes = nodes
+        self.network = nn.Sequential(
+            nn.Linear(6 * nodes, WIDTH), *[_Block(WIDTH) for _ in range(BLOCKS)], nn.Linear(WIDTH, 3 * nodes)
+        )
+        for name, size in (("state_mean", 6), ("state_size", 6), ("force_mean", 3), ("force_size", 3)):
+            start = torch.zeros if name.endswith("mean") else torch.ones
+            self.register_buffer(name, start(size * nodes))
+
+    def normalise(self, states: Tensor, forces: Tensor) -> None:
+        """Take means and standard deviations from training states (S, 6 N) and forces (S, 3 N)."""
+        for name, values in (("state", states), ("force", forces)):
+            size = values.std(0)
+            size = torch.where(size > 1e-6 * size.max(), size, torch.ones_like(size))
+            getattr(self, f"{name}_mean").copy_(values.mean(0))
+            getattr(self, f"{name}_size").copy_(size)
+
+    def forward(self, states: Tensor) -> Tensor:
+        """Normalised forces (S, 3 N) of states (S, 6 N)."""
+        return self.network((states - self.state_mean) / self.state_size)
+
+    def on(self, simulator: Simulator) -> ResidualForce:
+        """(q, v, external force) -> nodal forces [N], all (B, N, 3).
+
+        Raises:
+            InputError: a mesh of another number of vertices.
+        """
+        found = len(simulator.mesh.vertices)
+        if found != self.nodes:
+            raise InputError(
+                f"srl: expected the mesh it was trained on, of {self.nodes} vertices, found {found}; train it on this "
+                "mesh, or use method rafl, which works on any"
+            )
+
+        def force(q: Tensor, v: Tensor, external: Tensor) -> Tensor:
+            state = torch.cat([q.flatten(1), v.flatten(1)], dim=1).float()
+            return (self(state) * self.force_size + self.force_mean).double().reshape(q.shape)
+
+        return force

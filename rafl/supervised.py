@@ -1,0 +1,93 @@
+"""Supervised residual learning (paper, SRL baseline, after Gao et al.): targets, then a network to give them."""
+
+import math
+from functools import partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from groundwork import InputError, progress
+from rafl.dataset import Dataset
+from rafl.fit import Report, batches, mean_error, shortened, training_items, validation_batches
+from rafl.global_residual import GlobalResidual
+from rafl.run import FORMAT, FittedModel, Settings, load_model, load_tensors, save_model, save_tensors, write_history
+from rafl.targets import residual_targets
+
+STATES = 256  # an update
+RATE = 1e-3  # Adam's, at the start of the cosine decay
+JUDGED = 25  # epochs between rollouts of the validation recordings
+PENALTY = 1e-4  # lambda_1 of the targets [m^2/N^2]
+TARGETS = "targets.pt"
+
+
+def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
+    """Solve for each step's residual force, then train a `GlobalResidual` to give it.
+
+    Targets stand in `targets.pt` of the run and are not computed again. The network that simulates the validation
+    recordings best is kept; it is asked every 25th epoch.
+
+    Raises:
+        InputError: nothing to train on, or datasets of different meshes.
+        SimulationError: the recordings cannot be followed.
+    """
+    cut = [shortened(dataset, settings.frames) for dataset in datasets]
+    counts = {len(dataset.simulator.mesh.vertices) for dataset in cut}
+    if len(counts) > 1:
+        raise InputError(
+            f"srl: expected datasets of one mesh, found {', '.join(str(n) for n in sorted(counts))} vertices; train "
+            "one model each, or use method rafl"
+        )
+    training_items(cut)
+    validate = validation_batches(cut)
+    states, forces = _lessons(cut, run)
+    torch.manual_seed(settings.seed)
+    network = GlobalResidual(counts.pop())
+    network.normalise(states, forces)
+    wanted = (forces - network.force_mean) / network.force_size
+    model = FittedModel("srl", network=network)
+    optimiser = torch.optim.Adam(network.parameters(), lr=RATE, weight_decay=settings.weight_decay)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs, eta_min=0.01 * RATE)
+    history = [{"epoch": 0, "loss": math.nan, "validation_mm": 1e3 * mean_error(validate, FittedModel("original"))}]
+    report(history[-1])
+    best = math.inf
+    for epoch in range(1, settings.epochs + 1):
+        total = 0.0
+        chosen_batches = torch.randperm(len(states)).split(STATES)
+        for chosen in chosen_batches:
+            optimiser.zero_grad()
+            loss = (network(states[chosen]) - wanted[chosen]).square().mean()
+            loss.backward()
+            optimiser.step()
+            total += loss.item() * len(chosen) / len(states)
+        schedule.step()
+        if epoch % JUDGED and epoch < settings.epochs:
+            continue
+        error = 1e3 * mean_error(validate, model)
+        history.append({"epoch": epoch, "loss": total, "validation_mm": error})
+        if error < best or not (run / "model.pt").exists():
+            best = min(best, error)
+            save_model(run, model)
+        write_history(run, history)
+        report(history[-1])
+    return load_model(run)
+
+
+def _lessons(datasets: list[Dataset], run: Path) -> tuple[Tensor, Tensor]:
+    """States (S, 6 N) and target forces (S, 3 N), in single precision."""
+    path = run / TARGETS
+    if not path.exists():
+        states, forces = [], []
+        with progress() as bar:
+            for recordings in batches(training_items(datasets)):
+                steps = len(recordings.markers) - 1
+                task = bar.add_task(f"{recordings.dataset.name}: residual forces", total=steps)
+                targets = residual_targets(recordings, PENALTY, partial(bar.advance, task))
+                chosen = recordings.valid[1:].amax(-1).bool()
+                state = torch.cat([torch.from_numpy(x).flatten(2) for x in (targets.q, targets.v)], dim=-1)
+                states.append(state[chosen].float())
+                forces.append(torch.from_numpy(targets.force).flatten(2)[chosen].float())
+        content: dict[str, object] = {"states": torch.cat(states), "forces": torch.cat(forces)}
+        save_tensors(path, {"format": FORMAT, "method": "srl", **content})
+    saved = load_tensors(path, "residual forces of this run")
+    return saved["states"], saved["forces"]

@@ -1,0 +1,147 @@
+"""Residual forces that recordings call for, step by step (paper, eq. 4): what supervised learning learns."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from rafl.dataset import Dataset
+from rafl.errors import SimulationError
+from rafl.objective import Recordings
+from rafl.simulator import Simulator
+
+Array = NDArray[Any]
+
+MOST_ITERATIONS = 12
+ENOUGH = 1e-8  # of the objective: a smaller gain ends the iteration
+
+
+@dataclass(frozen=True)
+class Targets:
+    """States of some recordings simulated with the forces that follow the markers best, and those forces.
+
+    Attributes:
+        q, v: at the start of each step [m], [m/s], (T - 1, B, N, 3).
+        force: [N], (T - 1, B, N, 3).
+        objective: of each step, sum |x - x_bar|^2 + penalty sum f^2 [m^2], (T - 1, B).
+    """
+
+    q: Array
+    v: Array
+    force: Array
+    objective: Array
+
+
+def residual_targets(recordings: Recordings, penalty: float, tick: Callable[[], None] = lambda: None) -> Targets:
+    """Solve eq. 4 for every step in turn, by Gauss and Newton's method.
+
+    The step's adjoint gives all of the markers' derivatives by the force at once; within a step they hardly change
+    and are computed once.
+
+    Args:
+        recordings: of one dataset, whose simulator steps by plain backward differences.
+        penalty: lambda_1 [m^2/N^2].
+        tick: called after every step.
+
+    Raises:
+        SimulationError: a step failed; names recordings and step.
+    """
+    dataset = recordings.dataset
+    simulator = dataset.simulator
+    if simulator.integrator != "implicit-euler" or simulator.substeps != 1 or simulator.parameters().damped:
+        raise SimulationError(
+            f"{dataset.name}: expected implicit-euler, one substep and no damping for residual targets, found "
+            f"{simulator.integrator}, {simulator.substeps} substeps; fit another method"
+        )
+    start = dataset.start(recordings.names)
+    q, v = start.q.numpy().copy(), start.v.numpy().copy()
+    external = start.force.numpy() + simulator.weight
+    mass = simulator.node_mass + start.added_mass.numpy()
+    force = np.zeros_like(q)
+    parts: list[tuple[Array, Array, Array, Array]] = []
+    for step in range(1, len(recordings.markers)):
+        problem = _Step(simulator, dataset, q, v, external, mass, recordings, step, penalty)
+        after, force, objective = problem.solve(force)
+        parts.append((q, v, force, objective))
+        q, v = after, (after - q) / simulator.time_step
+        tick()
+    return Targets(*(np.stack(part) for part in zip(*parts, strict=True)))
+
+
+@dataclass(frozen=True)
+class _Step:
+    simulator: Simulator
+    dataset: Dataset
+    q: Array
+    v: Array
+    external: Array
+    mass: Array
+    recordings: Recordings
+    number: int
+    penalty: float
+
+    def solve(self, force: Array) -> tuple[Array, Array, Array]:
+        """Positions after the step, the force, and the objective (B), starting at the last step's force."""
+        x = self._after(force, None)
+        gap: Array
+        objective: Array
+        gap, objective = self._judge(x, force)
+        seen = np.repeat(self.recordings.valid[self.number].numpy(), 3, axis=1)
+        slopes = self._slopes(x) * seen[..., None]
+        across = slopes.swapaxes(1, 2)
+        normal = [cho_factor(a @ a.T + self.penalty * np.eye(len(a)), check_finite=False) for a in slopes]
+        free = self.simulator.engine.free_index
+        for _ in range(MOST_ITERATIONS):
+            flat = force.reshape(len(force), -1)[:, free]
+            right = (slopes @ flat[..., None])[..., 0] - gap
+            weights = np.stack([cho_solve(a, b, check_finite=False) for a, b in zip(normal, right, strict=True)])
+            best = (across @ weights[..., None])[..., 0]
+            trial = force.copy().reshape(len(force), -1)
+            trial[:, free] = best
+            trial = trial.reshape(force.shape)
+            moved = self._after(trial, x)
+            new_gap, new_objective = self._judge(moved, trial)
+            better = new_objective < objective
+            gain = float(((objective - new_objective) / np.maximum(objective, 1e-30))[better].max(initial=0.0))
+            keep = better[:, None, None]
+            force, x = np.where(keep, trial, force), np.where(keep, moved, x)
+            gap = np.where(better[:, None], new_gap, gap)
+            objective = np.where(better, new_objective, objective)
+            if gain < ENOUGH:
+                break
+        return x, force, objective
+
+    def _after(self, force: Array, guess: Array | None) -> Array:
+        h = self.simulator.time_step
+        target = self.q + h * self.v
+        begin = target.copy() if guess is None else guess.copy()
+        begin[:, self.simulator.fixed] = self.q[:, self.simulator.fixed]
+        what = f"step {self.number} of {', '.join(self.recordings.names)}"
+        resistance = self.simulator.resistance(len(self.q))
+        return self.simulator.minimise(begin, self.mass / h**2, target, self.external + force, resistance, what)
+
+    def _judge(self, x: Array, force: Array) -> tuple[Array, Array]:
+        """Marker gaps (B, 3 M) [m], nought where not seen, and the objective (B)."""
+        markers = self.dataset.markers.positions(torch.from_numpy(x))
+        gap = (markers - self.recordings.markers[self.number]) * self.recordings.valid[self.number][..., None]
+        flat = gap.flatten(1).numpy()
+        return flat, (flat**2).sum(1) + self.penalty * (force**2).sum((1, 2))
+
+    def _slopes(self, x: Array) -> Array:
+        """Derivatives of the markers by the forces on free nodes [m/N], (B, 3 M, n)."""
+        engine, batch = self.simulator.engine, len(x)
+        by_corner = self.dataset.markers.slopes(torch.from_numpy(x)).numpy()  # (B, M, 3, 4, 3)
+        quad = self.dataset.markers.quad
+        count = len(quad)
+        right = np.zeros((batch, count, 3, x.shape[1], 3))
+        for corner in range(4):
+            right[:, np.arange(count), :, quad[:, corner]] += by_corner[:, :, :, corner].swapaxes(0, 1)
+        diagonal = np.repeat(self.mass / self.simulator.time_step**2, 3, axis=1)[:, engine.free_index]
+        with engine.threads(batch):
+            tangents = engine.terms(x, self.simulator.resistance(batch), tangent=True)[2]
+            columns = np.ascontiguousarray(right.reshape(batch, 3 * count, -1)[:, :, engine.free_index])
+            return engine.solve_once(tangents, diagonal, columns)
