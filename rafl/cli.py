@@ -1,9 +1,9 @@
 """The commands `rafl-fit` and `rafl-eval`."""
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
+import pandas as pd
 import torch
 import typer
 from rich.console import Console
@@ -13,23 +13,17 @@ from groundwork import InputError, command_line, progress, user_command, write_t
 from rafl.dataset import Dataset, read_dataset
 from rafl.errors import SimulationError
 from rafl.evaluation import Comparison, compare, error_table, held_out_errors, split_table
-from rafl.fit import fit_residual_field, training_items
+from rafl.fit import training_items
+from rafl.methods import EPOCHS, METHODS
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
-from rafl.sysid import identify_material
+from rafl.sysid import spoken
 
 # The network is small; the other core serves the element kernels.
 TORCH_THREADS = 1
 
 fit_app = command_line("Fit a model to recordings.")
 eval_app = command_line("Measure a fitted model.")
-
-
-class Method(StrEnum):
-    """What to fit."""
-
-    rafl = "rafl"
-    sysid = "sysid"
 
 
 def _simulating(error: SimulationError) -> typer.Exit:
@@ -41,9 +35,17 @@ def _simulating(error: SimulationError) -> typer.Exit:
 @user_command
 def fit(
     datasets: Annotated[list[Path], typer.Argument(help="Dataset files (.h5) to train on.", metavar="DATASET...")],
-    method: Annotated[Method, typer.Option(help="rafl: residual field; sysid: E and nu.")] = Method.rafl,
+    method: Annotated[
+        str,
+        typer.Option(
+            help="rafl: residual field; srl: supervised baseline; sysid: E and nu, sysid-e: E at nu = 0.499, "
+            "sysid-damping: E, nu and damping."
+        ),
+    ] = "rafl",
     out: Annotated[Path | None, typer.Option(help="Run folder [runs/DATASET-METHOD].")] = None,
-    epochs: Annotated[int, typer.Option(min=1, help="Passes over the recordings (iterations of sysid), at most.")] = 60,
+    epochs: Annotated[
+        int | None, typer.Option(min=1, help="Passes over the recordings (iterations of sysid), at most [by method].")
+    ] = None,
     learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start (rafl).")] = 5e-3,
     weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's (rafl).")] = 1e-5,
     patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping (rafl).")] = 20,
@@ -63,12 +65,15 @@ def fit(
     Example: rafl-fit datasets/thick.h5 --out runs/thick
     """
     torch.set_num_threads(TORCH_THREADS)
+    if method not in METHODS:
+        raise InputError(f"--method: expected {', '.join(METHODS)}, found {method!r}")
     if frames == 1:
         raise InputError("--frames: expected 0 (all) or at least 2, found 1")
     loaded = [read_dataset(path) for path in datasets]
-    run = out or Path("runs") / f"{loaded[0].name}-{method.value}"
+    run = out or Path("runs") / f"{loaded[0].name}-{method}"
+    epochs = epochs or EPOCHS[method]
     settings = Settings(
-        method.value, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
+        method, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
         weight_decay, patience, frames, seed, batch, force_penalty, warm_start if start is None else 0,
         str(start.resolve()) if start else "", by_sigma,
     )  # fmt: skip
@@ -87,11 +92,13 @@ def fit(
             bar.console.print(f"{label} {row[kind]:3.0f}: {values}", highlight=False, soft_wrap=True)
 
         try:
-            method_of = fit_residual_field if method is Method.rafl else identify_material
-            model = method_of(loaded, settings, run, report)
+            model = METHODS[method](loaded, settings, run, report)
         except SimulationError as error:
             raise _simulating(error) from None
     typer.echo(_described(model))
+    if (run / "parameters.csv").exists():
+        for line in spoken(pd.read_csv(run / "parameters.csv")):
+            typer.echo(line)
     typer.echo(f"wrote {run}/ (model.pt, history.csv, config.yaml)")
     typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in datasets)}")
 
@@ -112,6 +119,8 @@ def _described(model: FittedModel) -> str:
     if model.material is not None:
         e, nu = model.material["youngs_modulus"], model.material["poissons_ratio"]
         return f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
+    if model.network is not None:
+        return f"trained a supervised residual network for meshes of {model.network.nodes} vertices"
     return "trained a residual acceleration field"
 
 

@@ -8,6 +8,7 @@ from rafl.rollout import ResidualForce
 from rafl.simulator import Simulator
 
 WIDTH, BLOCKS, LAYERS = 512, 5, 3
+LEAST_SIZE = 0.05
 
 
 class _Block(nn.Module):
@@ -47,11 +48,16 @@ class GlobalResidual(nn.Module):
 
     def normalise(self, states: Tensor, forces: Tensor) -> None:
         """Take means and standard deviations from training states (S, 6 N) and forces (S, 3 N)."""
-        for name, values in (("state", states), ("force", forces)):
-            size = values.std(0)
-            size = torch.where(size > 1e-6 * size.max(), size, torch.ones_like(size))
-            getattr(self, f"{name}_mean").copy_(values.mean(0))
-            getattr(self, f"{name}_size").copy_(size)
+        positions, velocities = states.chunk(2, dim=1)
+        # What hardly moves must not be blown up: a twentieth of the liveliest is the least size of its kind.
+        sizes = [
+            values.std(0).clamp_min(LEAST_SIZE * float(values.std(0).max()))
+            for values in (positions, velocities, forces)
+        ]
+        self.state_mean.copy_(states.mean(0))
+        self.state_size.copy_(torch.cat(sizes[:2]))
+        self.force_mean.copy_(forces.mean(0))
+        self.force_size.copy_(sizes[2])
 
     def forward(self, states: Tensor) -> Tensor:
         """Normalised forces (S, 3 N) of states (S, 6 N)."""

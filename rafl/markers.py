@@ -37,14 +37,11 @@ class Markers:
 
     def slopes(self, q: Tensor) -> Tensor:
         """Derivatives of the markers' positions by their quads' corners, (..., M, 3, 4, 3)."""
-        corners = q[..., torch.from_numpy(self.quad), :]
-        columns = []
-        for corner in range(4):
-            for axis in range(3):
-                direction = torch.zeros_like(corners)
-                direction[..., corner, axis] = 1.0
-                columns.append(torch.func.jvp(self._from_corners, (corners,), (direction,))[1])
-        return torch.stack(columns, dim=-1).unflatten(-1, (4, 3))
+        with torch.enable_grad():
+            corners = q[..., torch.from_numpy(self.quad), :].detach().requires_grad_()
+            position = self._from_corners(corners)
+            rows = [torch.autograd.grad(position[..., i].sum(), corners, retain_graph=True)[0] for i in range(3)]
+        return torch.stack(rows, dim=-3)
 
     def _from_corners(self, corners: Tensor) -> Tensor:
         """Positions (..., M, 3) from the quads' corners (..., M, 4, 3)."""

@@ -1,94 +1,231 @@
-"""System identification: Young's modulus and Poisson's ratio by exact gradients (paper, SysID baseline)."""
+"""System identification by exact gradients (paper, SysID baseline): E and nu, E alone, or damping too."""
 
+import itertools
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import torch
-from scipy.optimize import minimize
+from numpy.typing import NDArray
+from scipy.optimize import OptimizeResult, minimize
+from torch import Tensor
 
+from groundwork import write_text
 from rafl.dataset import Dataset
 from rafl.errors import SimulationError
 from rafl.fit import Report, batches, mean_error, shortened, training_items, validation_batches
 from rafl.objective import training_loss
-from rafl.run import FittedModel, Settings, read_history, save_model, write_history
+from rafl.run import FORMAT, FittedModel, Settings, load_tensors, save_model, save_tensors, write_history
 
-MODULUS = (2e4, 1e7)  # Pa
-POISSON = (0.3, 0.499)
+Array = NDArray[Any]
+
+NEARLY_INCOMPRESSIBLE = 0.499  # nu where E alone is sought, as the paper has it
+STARTS = (0.6, 1.7)  # times the assumed E, where the search begins again
+ROUNDS = 2  # iterations before the best of the starts goes on alone
+NORMAL = 1.959964  # 95 % of a normal distribution lie within as many standard deviations
+STEP = 1e-3  # of a variable, for the curvature's finite differences of the exact gradient
 
 
-def _variables(youngs_modulus: float, poissons_ratio: float) -> np.ndarray:
-    """(log E, log(1/2 - nu)): what stiffness and bulk stiffness are powers of."""
-    return np.log([youngs_modulus, 0.5 - poissons_ratio])
+@dataclass(frozen=True)
+class Quantity:
+    """One number to identify, and the variable in whose scale the search is even.
+
+    Attributes:
+        name: in `rafl.parameters.Parameters`.
+        low, high: bounds.
+        kind: `log`: its logarithm; `gap`: the logarithm of 1/2 minus it; `root`: its square root.
+        unit: for messages.
+    """
+
+    name: str
+    low: float
+    high: float
+    kind: str
+    unit: str
+
+    def variable(self, value: float) -> float:
+        """Of a value."""
+        if self.kind == "log":
+            return float(np.log(value))
+        return float(np.log(0.5 - value)) if self.kind == "gap" else float(np.sqrt(value))
+
+    def value(self, variable: Any) -> Any:
+        """Of a variable, a float or a tensor."""
+        exp = torch.exp if isinstance(variable, Tensor) else np.exp
+        if self.kind == "log":
+            return exp(variable)
+        return 0.5 - exp(variable) if self.kind == "gap" else variable**2
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Of the variable."""
+        a, b = self.variable(self.low), self.variable(self.high)
+        return min(a, b), max(a, b)
 
 
-def _identified(x: np.ndarray) -> dict[str, float]:
-    return {"youngs_modulus": float(np.exp(x[0])), "poissons_ratio": float(0.5 - np.exp(x[1]))}
+MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa")
+POISSON = Quantity("poissons_ratio", 0.3, 0.499, "gap", "")
+DAMPING = Quantity("mass_damping", 0.0, 100.0, "root", "1/s")
+SOUGHT = {"sysid": (MODULUS, POISSON), "sysid-e": (MODULUS,), "sysid-damping": (MODULUS, POISSON, DAMPING)}
 
 
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
-    """Fit E and nu to the training recordings by L-BFGS-B from the datasets' assumed material.
+    """Fit material numbers to the training recordings by L-BFGS-B within bounds, from several starts.
 
-    Where `history.csv` stands in `run` already, the search goes on from its last row.
+    The search begins at the datasets' assumed material and at softer and stiffer ones; after two iterations the best
+    goes on. `parameters.csv` in the run says how sure each number is and which trade off against one another. What a
+    killed run had tried is read from its checkpoint and not simulated again.
 
     Raises:
         InputError: no recording to train on.
         SimulationError: the assumed material itself cannot be simulated.
     """
-    cut = [shortened(dataset, settings.frames) for dataset in datasets]
-    train, validate = batches(training_items(cut), settings.by_sigma), validation_batches(cut)
-    count = sum(len(recordings.names) for recordings in train)
-    history = read_history(run)
-    losses: dict[bytes, float] = {}
-
-    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        parameters = torch.tensor(x, dtype=torch.float64, requires_grad=True)
-        values = {"youngs_modulus": parameters[0].exp(), "poissons_ratio": 0.5 - parameters[1].exp()}
-        total = torch.zeros((), dtype=torch.float64)
-        try:
-            for recordings in train:
-                simulated, forces = recordings.simulate(parameters=recordings.dataset.simulator.parameters(**values))
-                total = total + training_loss(recordings, simulated, forces) * len(recordings.names) / count
-        except SimulationError:
-            if not losses:
-                raise
-            return 1e6, np.zeros(2)  # a trial step too far: the line search comes back
-        total.backward()
-        assert parameters.grad is not None
-        losses[x.tobytes()] = total.item()
-        return total.item(), parameters.grad.numpy().copy()
-
-    def record(x: np.ndarray) -> None:
-        row = {
-            "epoch": len(history),
-            "loss": losses[x.tobytes()] if x.tobytes() in losses else objective(x)[0],
-            "validation_mm": 1e3 * mean_error(validate, FittedModel("sysid", material=_identified(x))),
-            **_identified(x),
-        }
-        history.append(row)
-        write_history(run, history)
-        report(row)
-
-    assumed = datasets[0].simulator.material
-    if history:
-        start = _variables(history[-1]["youngs_modulus"], history[-1]["poissons_ratio"])
-    else:
-        start = _variables(assumed.youngs_modulus, float(np.clip(assumed.poissons_ratio, *POISSON)))
-        record(start)
-
-    def relative(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = objective(x)
-        return value / history[0]["loss"], slope / history[0]["loss"]
-
-    stiffest, softest = _variables(MODULUS[1], POISSON[0]), _variables(MODULUS[0], POISSON[1])
-    result = minimize(
-        relative,
-        start,
-        jac=True,
-        method="L-BFGS-B",
-        bounds=[(softest[0], stiffest[0]), (softest[1], stiffest[1])],
-        callback=record,
-        options={"maxiter": max(settings.epochs - len(history) + 1, 0), "ftol": 1e-7, "gtol": 1e-7},
-    )
-    model = FittedModel("sysid", material=_identified(result.x))
+    search = _Search(datasets, settings, run, report)
+    begins = search.begins()
+    first = [search.descend(begin, ROUNDS) for begin in begins]
+    best = min(first, key=lambda result: result.fun)
+    last = search.descend(best.x, max(settings.epochs - ROUNDS, 0))
+    model = search.model(last.x)
+    write_text(run / "parameters.csv", search.certainty(last.x))
     save_model(run, model)
     return model
+
+
+class _Search:
+    """The objective, what it has been asked so far, and the history."""
+
+    def __init__(self, datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> None:
+        cut = [shortened(dataset, settings.frames) for dataset in datasets]
+        self.train, self.validate = batches(training_items(cut), settings.by_sigma), validation_batches(cut)
+        self.quantities, self.settings, self.run, self.report = SOUGHT[settings.method], settings, run, report
+        self.assumed = datasets[0].simulator.material
+        self.history: list[dict[str, float]] = []
+        self.known: dict[tuple[float, ...], tuple[float, list[float]]] = {}
+        self.file = run / "checkpoint.pt"
+        if self.file.exists():
+            saved = load_tensors(self.file, "a checkpoint of this run")
+            self.known = {tuple(x): (loss, slope) for x, loss, slope in saved["known"]}
+
+    def begins(self) -> list[Array]:
+        """Where to begin: the assumed material first."""
+        own = np.array([
+            np.clip(q.variable(max(float(getattr(self.assumed, q.name)), q.low)), *q.bounds) for q in self.quantities
+        ])  # fmt: skip
+        if self.settings.method == "sysid-damping":
+            own[2] = max(own[2], DAMPING.variable(1.0))
+        result = [own]
+        for factor in STARTS:
+            other = own.copy()
+            other[0] = np.clip(own[0] + np.log(factor), *MODULUS.bounds)
+            result.append(other)
+        return result
+
+    def values(self, x: Any) -> dict[str, Any]:
+        """Parameters by name, of variables."""
+        found = {q.name: q.value(x[k]) for k, q in enumerate(self.quantities)}
+        return {"poissons_ratio": NEARLY_INCOMPRESSIBLE, **found} if len(found) == 1 else found
+
+    def model(self, x: Array) -> FittedModel:
+        """With the material of variables x."""
+        material = {name: float(value) for name, value in self.values(x).items()}
+        return FittedModel(self.settings.method, material=material)
+
+    def __call__(self, x: Array) -> tuple[float, Array]:
+        """Loss and its gradient."""
+        key = tuple(float(value) for value in x)
+        if key not in self.known:
+            try:
+                self.known[key] = self._simulate(x)
+            except SimulationError:
+                if not self.known:
+                    raise
+                return 1e6, np.zeros(len(x))  # a trial step too far: the line search comes back
+            content = [[list(x), loss, slope] for x, (loss, slope) in self.known.items()]
+            save_tensors(self.file, {"format": FORMAT, "method": self.settings.method, "known": content})
+        loss, slope = self.known[key]
+        return loss, np.array(slope)
+
+    def _simulate(self, x: Array) -> tuple[float, list[float]]:
+        variables = torch.tensor(x, dtype=torch.float64, requires_grad=True)
+        values = self.values(variables)
+        count = sum(len(recordings.names) for recordings in self.train)
+        total = torch.zeros((), dtype=torch.float64)
+        for recordings in self.train:
+            simulated, forces = recordings.simulate(parameters=recordings.dataset.simulator.parameters(**values))
+            total = total + training_loss(recordings, simulated, forces) * len(recordings.names) / count
+        total.backward()
+        assert variables.grad is not None
+        return total.item(), variables.grad.tolist()
+
+    def descend(self, start: Array, iterations: int) -> OptimizeResult:
+        """L-BFGS-B from a start."""
+        scale = self(self.begins()[0])[0]
+
+        def relative(x: Array) -> tuple[float, Array]:
+            loss, slope = self(x)
+            return loss / scale, slope / scale
+
+        if not self.history:
+            self.record(start, 0)
+        return minimize(
+            relative, start, jac=True, method="L-BFGS-B", bounds=[q.bounds for q in self.quantities],
+            callback=lambda x: self.record(x, int(self.history[-1]["epoch"]) + 1),
+            options={"maxiter": iterations, "ftol": 1e-9, "gtol": 1e-8},
+        )  # fmt: skip
+
+    def record(self, x: Array, number: int) -> None:
+        """A row of the history."""
+        model = self.model(x)
+        assert model.material is not None
+        error = 1e3 * mean_error(self.validate, model)
+        self.history.append({"epoch": number, "loss": self(x)[0], "validation_mm": error, **model.material})
+        write_history(self.run, self.history)
+        self.report(self.history[-1])
+
+    def certainty(self, x: Array) -> str:
+        """As CSV: each value with its 95 % interval, and how they trade off against one another.
+
+        Markers' errors are taken as independent, of the size of what the fit leaves; the curvature of the loss then
+        is the information. A number at its bound has no interval.
+        """
+        inside = [k for k, q in enumerate(self.quantities) if q.bounds[0] + STEP < x[k] < q.bounds[1] - STEP]
+        covariance = np.full((len(x), len(x)), np.nan)
+        if inside:
+            columns = []
+            for k in inside:
+                h = STEP * np.eye(len(x))[k]
+                columns.append((self(x + h)[1] - self(x - h)[1])[inside] / (2.0 * STEP))
+            curvature = 0.5 * (np.array(columns) + np.array(columns).T)
+            seen = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.train)
+            own = 2.0 * self(x)[0] / max(seen - len(x), 1.0) * np.linalg.pinv(curvature)
+            covariance[np.ix_(inside, inside)] = own
+        sigma = np.sqrt(np.diag(covariance))
+        names = [q.name for q in self.quantities]
+        lines = ["name,unit,value,low_95,high_95," + ",".join(f"correlation_{name}" for name in names)]
+        for k, q in enumerate(self.quantities):
+            ends = sorted(float(q.value(x[k] + sign * NORMAL * sigma[k])) for sign in (-1.0, 1.0))
+            signs = [1.0 if item.kind != "gap" else -1.0 for item in self.quantities]
+            correlation = [signs[k] * signs[j] * covariance[k, j] / (sigma[k] * sigma[j]) for j in range(len(x))]
+            cells = [float(q.value(x[k])), *ends, *correlation]
+            lines.append(f"{q.name},{q.unit}," + ",".join("" if np.isnan(cell) else f"{cell:.6g}" for cell in cells))
+        return "\n".join(lines) + "\n"
+
+
+def spoken(table: pd.DataFrame) -> list[str]:
+    """What `parameters.csv`, read as a data frame, says, in sentences."""
+    lines = []
+    for row in table.to_dict("records"):
+        unit = f" {row['unit']}" if isinstance(row["unit"], str) else ""
+        interval = f"95 % interval {row['low_95']:.5g} to {row['high_95']:.5g}"
+        interval = interval if np.isfinite(row["low_95"]) else "at its bound: no interval"
+        lines.append(f"{row['name']} = {row['value']:.5g}{unit} ({interval})")
+    for a, b in itertools.combinations(range(len(table)), 2):
+        c = float(table[f"correlation_{table['name'][b]}"][a])
+        if abs(c) > 0.9:
+            lines.append(
+                f"{table['name'][a]} and {table['name'][b]} trade off against one another (correlation {c:+.3f}): the "
+                "recordings tell them apart poorly"
+            )
+    return lines

@@ -87,8 +87,6 @@ class _Step:
     def solve(self, force: Array) -> tuple[Array, Array, Array]:
         """Positions after the step, the force, and the objective (B), starting at the last step's force."""
         x = self._after(force, None)
-        gap: Array
-        objective: Array
         gap, objective = self._judge(x, force)
         seen = np.repeat(self.recordings.valid[self.number].numpy(), 3, axis=1)
         slopes = self._slopes(x) * seen[..., None]
@@ -100,17 +98,15 @@ class _Step:
             right = (slopes @ flat[..., None])[..., 0] - gap
             weights = np.stack([cho_solve(a, b, check_finite=False) for a, b in zip(normal, right, strict=True)])
             best = (across @ weights[..., None])[..., 0]
-            trial = force.copy().reshape(len(force), -1)
-            trial[:, free] = best
-            trial = trial.reshape(force.shape)
+            trial = force.copy()
+            trial.reshape(len(force), -1)[:, free] = best
             moved = self._after(trial, x)
             new_gap, new_objective = self._judge(moved, trial)
-            better = new_objective < objective
+            better: Array = new_objective < objective
             gain = float(((objective - new_objective) / np.maximum(objective, 1e-30))[better].max(initial=0.0))
             keep = better[:, None, None]
             force, x = np.where(keep, trial, force), np.where(keep, moved, x)
-            gap = np.where(better[:, None], new_gap, gap)
-            objective = np.where(better, new_objective, objective)
+            gap[better], objective[better] = new_gap[better], new_objective[better]
             if gain < ENOUGH:
                 break
         return x, force, objective

@@ -1,6 +1,8 @@
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 import torch
 
@@ -8,9 +10,12 @@ from groundwork import InputError
 from rafl import fit
 from rafl.dataset import Dataset
 from rafl.fit import fit_residual_field, mean_error, training_items
+from rafl.mesh import HexMesh
 from rafl.objective import Recordings
 from rafl.run import FittedModel, Settings, load_model
-from rafl.sysid import identify_material
+from rafl.supervised import fit_supervised
+from rafl.sysid import _Search, identify_material, spoken
+from rafl.targets import residual_targets
 
 SETTINGS = Settings("rafl", ("small.h5",), 3, 2e-3, 1e-5, 10, 12, 5)
 
@@ -70,13 +75,77 @@ def test_system_identification_explains_the_recordings(dataset: Dataset, tmp_pat
     assert load_model(tmp_path).material == model.material
 
 
-def test_an_interrupted_identification_goes_on(dataset: Dataset, tmp_path: Path) -> None:
-    settings = replace(SETTINGS, method="sysid", epochs=2)
-    identify_material([dataset], settings, tmp_path, silent)
-    rows: list[dict[str, float]] = []
-    identify_material([dataset], replace(settings, epochs=5), tmp_path, rows.append)
-    assert [row["epoch"] for row in rows] == [3, 4, 5][: len(rows)]
-    assert rows[-1]["loss"] < 0.5 * rows[0]["loss"] or rows[-1]["loss"] < 1e-4
+def test_an_interrupted_identification_goes_on(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It ends as an uninterrupted one, and what was simulated before the end came is not simulated again."""
+    settings = replace(SETTINGS, method="sysid", epochs=4)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    identify_material([dataset], settings, whole, silent)
+
+    def stop(row: dict[str, float]) -> None:
+        if row["epoch"] == 3:
+            raise KeyboardInterrupt
+
+    calls = []
+    simulate = _Search._simulate
+    monkeypatch.setattr(_Search, "_simulate", lambda self, x: (calls.append(tuple(x)), simulate(self, x))[1])
+    with pytest.raises(KeyboardInterrupt):
+        identify_material([dataset], settings, broken, stop)
+    identify_material([dataset], settings, broken, silent)
+    assert len(calls) == len(set(calls))
+    assert (whole / "history.csv").read_text() == (broken / "history.csv").read_text()
+    assert load_model(whole).material == load_model(broken).material
+
+
+def test_the_stated_uncertainty_is_the_actual_one(dataset: Dataset, tmp_path: Path) -> None:
+    """Over noisy copies of the recordings E scatters as its interval says; E and nu trade off, and it is said."""
+    random = np.random.default_rng(3)
+    found, widths = [], []
+    for k in range(8):
+        noisy = {
+            name: replace(item, markers=item.markers + random.normal(0, 2e-4, item.markers.shape))
+            for name, item in dataset.trajectories.items()
+        }
+        run = tmp_path / str(k)
+        settings = replace(SETTINGS, method="sysid-e", epochs=12, frames=12)
+        model = identify_material([replace(dataset, trajectories=noisy)], settings, run, silent)
+        assert model.material is not None
+        assert model.material["poissons_ratio"] == 0.499
+        table = pd.read_csv(run / "parameters.csv")
+        found.append(model.material["youngs_modulus"])
+        widths.append((table["high_95"][0] - table["low_95"][0]) / 2 / 1.96)
+    assert np.std(found, ddof=1) == pytest.approx(np.mean(widths), rel=0.8)
+
+
+def test_trading_off_is_said() -> None:
+    table = pd.DataFrame(
+        {
+            "name": ["youngs_modulus", "poissons_ratio"], "unit": ["Pa", np.nan], "value": [2e5, 0.45],
+            "low_95": [1.9e5, np.nan], "high_95": [2.1e5, np.nan],
+            "correlation_youngs_modulus": [1.0, -0.97], "correlation_poissons_ratio": [-0.97, 1.0],
+        }
+    )  # fmt: skip
+    first, second, third = spoken(table)
+    assert "1.9e+05 to 2.1e+05" in first
+    assert "no interval" in second
+    assert "-0.970" in third
+
+
+def test_supervised_residuals(dataset: Dataset, tmp_path: Path) -> None:
+    """The targets follow the recordings, the network learns them, and another mesh is refused by name."""
+    settings = replace(SETTINGS, method="srl", epochs=150, frames=0)
+    recordings = Recordings.of(dataset, ["a", "b"])
+    targets = residual_targets(recordings, 1e-8)
+    assert np.sqrt(targets.objective.mean() / 20) < 2e-5
+    model = fit_supervised([dataset], settings, tmp_path, silent)
+    train = [recordings]
+    assert mean_error(train, model) < 0.3 * mean_error(train, FittedModel("original"))
+    again = load_model(tmp_path)
+    assert mean_error(train, again) == mean_error(train, model)
+    other = replace(dataset.simulator, mesh=HexMesh.box((2, 1, 1), (0.02, 0.01, 0.01)))
+    with pytest.raises(InputError, match=r"srl: expected the mesh .* found 12"):
+        model.residual(other)
 
 
 def test_nothing_to_train_on_is_refused(dataset: Dataset) -> None:

@@ -46,3 +46,15 @@ def test_positions_are_differentiable(random: np.random.Generator) -> None:
     markers = tied((0.033, 0.02, 0.046), (0.05, 0.0, 0.011))
     q = torch.tensor(MESH.vertices + random.normal(0, 1e-3, MESH.vertices.shape)).requires_grad_()
     assert torch.autograd.gradcheck(markers.positions, (q,), eps=1e-6, atol=1e-7, fast_mode=True)
+
+
+def test_slopes_by_finite_differences(random: np.random.Generator) -> None:
+    mesh = HexMesh.box((3, 2, 2), (0.03, 0.02, 0.02))
+    points = np.array([[0.012, 0.0, 0.011], [0.02, 0.02, 0.003], [0.03, 0.01, 0.0105]]) + [0.0, -5e-4, 0.0]
+    markers = embed(mesh, ("a", "b", "c"), points)
+    q = torch.tensor(mesh.vertices + random.normal(0, 1e-3, (2, *mesh.vertices.shape)))
+    change = torch.tensor(random.normal(size=q.shape))
+    h = 1e-6
+    expected = (markers.positions(q + h * change) - markers.positions(q - h * change)) / (2 * h)
+    found = torch.einsum("bmick,bmck->bmi", markers.slopes(q), change[:, torch.from_numpy(markers.quad)])
+    torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-7)
