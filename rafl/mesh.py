@@ -120,6 +120,20 @@ class HexMesh:
         return self.quadrature.volume.sum(axis=1)
 
     @cached_property
+    def edges(self) -> NDArray[np.int64]:
+        """Pairs of vertices that a cell's edge joins, (K, 2)."""
+        pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1]
+        every = np.sort(self.hexes[:, pairs].reshape(-1, 2), axis=1)
+        return np.unique(every, axis=0)
+
+    def stretching(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """By how much of its length at rest a displacement (B, N, 3) changes the edge that it changes most, (B)."""
+        first, second = self.edges.T
+        length = np.linalg.norm(self.vertices[first] - self.vertices[second], axis=1)
+        change = displacement[:, first] - displacement[:, second]
+        return np.sqrt(((change**2).sum(-1) / length**2).max(axis=1))
+
+    @cached_property
     def surface(self) -> NDArray[np.int64]:
         """Boundary quads (S, 4): vertices anticlockwise seen from outside."""
         quads = np.concatenate([self.hexes[:, side] for side in CELL_SIDES.values()])

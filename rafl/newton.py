@@ -12,6 +12,7 @@ from rafl.resistance import Resistance
 
 Array = NDArray[Any]
 
+LONGEST = 0.3  # of an edge: what one step may change it by, lest the body snap through to another equilibrium
 TOLERANCE = 1e-10  # largest nodal residual accepted [N]
 ROUNDING = 8.0 * np.finfo(float).eps  # relative error allowed for in positions
 MAX_ITERATIONS = 200
@@ -51,9 +52,20 @@ def minimise(
     Raises:
         SimulationError: no convergence; names trajectory, residual and what to try.
     """
+    problem = (engine, start, inertia, target, force, resistance, what, factors or engine.allocate(len(start)))
+    try:
+        return _descend(*problem, LONGEST)
+    except SimulationError:
+        return _descend(*problem, np.inf)  # from a start so squeezed that only a leap leads out
+
+
+def _descend(
+    engine: Engine, start: Array, inertia: Array, target: Array, force: Array, resistance: Resistance, what: str,
+    factors: Factors, longest: float,
+) -> Array:  # fmt: skip
+    """`minimise` with steps that change no edge by more than `longest` times its length."""
     batch, shape = len(start), start.shape[1:]
     free = engine.free_index
-    factors = factors or engine.allocate(batch)
     diagonal = np.repeat(inertia, 3, axis=1)[:, free]
     wanted, load = target.reshape(batch, -1)[:, free], force.reshape(batch, -1)[:, free]
     q = start.reshape(batch, -1).copy()
@@ -89,7 +101,8 @@ def minimise(
             _factor(engine, at, resistance.rows(new), factors, new, diagonal[new], what, largest[new])
         step = -engine.solve(factors, running, residual[running][:, None])[:, 0]
         slope = _dot(step, residual[running])
-        length = np.ones(len(running))
+        change = engine.mesh.stretching(_scattered(step, free, q.shape[1]))
+        length = np.minimum(1.0, longest / np.maximum(change, 1e-300))
         pending = np.arange(len(running))
         for _ in range(40):
             rows = running[pending]
@@ -125,6 +138,13 @@ def minimise(
         f"{what}: trajectory {worst} did not converge (residual {largest[worst]:.3g} N, "
         f"wanted {enough[worst]:.0e} N); try a smaller time step, more substeps or a smaller load"
     )
+
+
+def _scattered(step: Array, free: Array, unknowns: int) -> Array:
+    """Displacements (R, N, 3) of steps (R, n)."""
+    full = np.zeros((len(step), unknowns))
+    full[:, free] = step
+    return full.reshape(len(step), -1, 3)
 
 
 def _dot(a: Array, b: Array) -> Array:
