@@ -3,10 +3,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 DEMO := build/demo
 SHARED ?= ../shared
+TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 # BLAS threads fight the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking clean
+.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking bench-paper clean
 
 install: $(VENV)/installed
 
@@ -56,6 +57,10 @@ bench-simulator: install
 # Tracking and calibration on footage made fresh (SEED=number for the same again), beside trackpy and OpenCV.
 bench-tracking: install
 	$(BIN)/python tests/bench/tracker.py $(if $(SEED),--seed $(SEED)) $(if $(wildcard $(SHARED)/real/clamped_beam),--real $(SHARED)/real/clamped_beam)
+
+# The paper's sim-to-sim studies, hours: make bench-paper; QUICK=1 in 20 minutes. Resumable.
+bench-paper: install
+	$(BIN)/python tests/bench/paper.py $(if $(QUICK),--quick,--results datasets/results) $(if $(wildcard $(TAIL)),--tail-cells $(TAIL))
 
 clean:
 	rm -rf build $(VENV)

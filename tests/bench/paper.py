@@ -1,0 +1,216 @@
+"""The paper's sim-to-sim studies from nothing: its shapes, methods and fine-tuning, its numbers beside ours.
+
+    python tests/bench/paper.py [vibration] [twist] [--quick] [--out build/paper] [--results datasets/results]
+                                [--tail-cells CELLS.npy]
+
+Each study is a file in datasets/experiments. Resumable: what stands under --out is not computed again. --quick leaves
+out the fine fish-tail and trains less.
+"""
+
+import argparse
+import platform
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from groundwork import whole_file, write_text
+from rafl.dataset import Dataset, read_dataset, write_dataset
+from rafl.evaluation import compare, split_table
+from rafl.material import Material
+from rafl.mesh import HexMesh
+from rafl.methods import METHODS
+from rafl.run import FittedModel, Settings, load_model, write_settings
+from rafl.simulator import Simulator
+from rafl.synthetic import hung, released, twisted, with_material
+
+EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
+SEED = 0
+LARGE = 1000  # vertices: such a shape is fine-tuned for fewer epochs, and left out by --quick
+COLUMNS = ["shape", "method", "mean_mm", "std_mm", "paper_mean_mm", "paper_std_mm"]
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How long to train."""
+
+    rafl: int
+    srl: int
+    fine: int
+    fine_large: int | None  # None leaves large shapes out, 0 only evaluates there
+
+
+FULL, QUICK = Effort(100, 1000, 60, 4), Effort(20, 150, 8, None)
+
+
+def mesh_of(shape: dict[str, Any]) -> HexMesh:
+    if "box_mm" in shape:
+        return HexMesh.box(shape["cells"], 1e-3 * np.array(shape["box_mm"]))
+    sections = shape.get("rectangles") or shape["ellipses"]
+    if "rectangles" in shape:
+        wide, high = max(w for w, _ in sections), max(h for _, h in sections)
+        cells = np.zeros((len(sections), wide, high), dtype=bool)
+        for x, (w, h) in enumerate(sections):
+            cells[x, (wide - w) // 2 : (wide + w) // 2, (high - h) // 2 : (high + h) // 2] = True
+    else:
+        wide, high = (int(max(axis[k] for axis in sections)) for k in (0, 1))
+        y, z = np.arange(-wide, wide + 1)[:, None], np.arange(-high, high + 1)
+        cells = np.array([(y / a) ** 2 + (z / b) ** 2 <= 1.0 for a, b in sections])
+    return HexMesh.from_grid(cells, 1e-3 * shape["element_mm"])
+
+
+class Study:
+    """One experiment under one folder."""
+
+    def __init__(self, name: str, out: Path, effort: Effort, tail: Path | None) -> None:
+        self.name, self.out, self.effort = name, out / name, effort
+        self.plan = yaml.safe_load((EXPERIMENTS / f"{name}.yaml").read_text())
+        shapes = yaml.safe_load((EXPERIMENTS / "shapes.yaml").read_text())["shapes"]
+        self.meshes = {shape: mesh_of(content) for shape, content in shapes.items()}
+        if tail is not None:
+            self.meshes["fishtail-fine"] = HexMesh.from_grid(np.load(tail), 0.003)
+        if effort.fine_large is None:
+            self.meshes = {shape: mesh for shape, mesh in self.meshes.items() if len(mesh.vertices) < LARGE}
+
+    def dataset(self, shape: str, *splits: str) -> Dataset:
+        """The recordings of some splits, made where they are not there yet."""
+        path = self.out / "datasets" / f"{shape}-{'-'.join(splits)}.h5"
+        if not path.exists():
+            print(f"{self.name}: recording {shape} ({', '.join(splits)})", flush=True)
+            mesh, motion = self.meshes[shape], self.plan["motion"]
+            base = Simulator(mesh, Material(**self.plan["base"]), mesh.face_nodes("x-min"))
+            target = with_material(base, **self.plan["target"])
+            split = {number: each for each in splits for number in self.plan["split"][each]}
+            if "hung_kg" in motion:
+                starts = hung(target, mesh.face_nodes("x-max"), np.array(motion["hung_kg"])[list(split)])
+            else:
+                twist = motion["twist_rad"]
+                random = np.random.default_rng(twist["seed"])
+                angles = random.uniform(twist["low"], twist["high"], twist["count"])
+                starts = twisted(mesh, angles[list(split)])
+            names = {f"{self.name}{number:02d}": each for number, each in split.items()}
+            write_dataset(path, released(shape, base, target, starts, self.plan["frames"], names, self.name))
+        return read_dataset(path)
+
+    def fit(self, run: str, method: str, shape: str, **changes: Any) -> FittedModel:
+        """A model, fitted where it is not yet; how long that took stands in its folder."""
+        folder = self.out / "runs" / run
+        if not (folder / "seconds").exists():
+            dataset = self.dataset(shape, "train", "val")
+            epochs = changes.pop("epochs")
+            settings = Settings(method, (shape,), epochs, 2e-3, 1e-5, epochs, 0, SEED, **changes)
+            write_settings(folder, settings)
+            begun = time.perf_counter()
+
+            def report(row: dict[str, float]) -> None:
+                words = ", ".join(f"{key} {value:.4g}" for key, value in row.items())
+                print(f"{self.name} {run}: {words}, {time.perf_counter() - begun:.0f} s", flush=True)
+
+            METHODS[method]([dataset], settings, folder, report)
+            write_text(folder / "seconds", f"{time.perf_counter() - begun:.1f}\n")
+        return load_model(folder)
+
+    def errors(self, shape: str, models: dict[str, FittedModel]) -> list[dict[str, Any]]:
+        """Rows of the table, from their file where they stand there."""
+        path = self.out / "errors" / f"{shape}-{'-'.join(models)}.csv"
+        if not path.exists():
+            table = split_table(compare(self.dataset(shape, "test"), models))
+            write_text(path, table.to_csv(index=False))
+        table = pd.read_csv(path)
+        rows = []
+        for row in table.to_dict("records"):
+            mean, std = self.plan["paper"][shape].get(row["method"], (np.nan, np.nan))
+            rows.append(
+                dict(zip(COLUMNS, (shape, row["method"], row["mean_mm"], row["std_mm"], mean, std), strict=True))
+            )
+        return rows
+
+    def table(self) -> pd.DataFrame:
+        """Every shape by every method that works on it."""
+        trained = self.plan["trained_on"]
+        rafl = self.fit("rafl", "rafl", trained, epochs=self.effort.rafl, batch=1, force_penalty=1e-6, warm_start=12)
+        srl = self.fit("srl", "srl", trained, epochs=self.effort.srl)
+        rows: list[dict[str, Any]] = []
+        for shape, mesh in self.meshes.items():
+            same = len(mesh.vertices) == len(self.meshes[trained].vertices)
+            rows += self.errors(shape, {"rafl": rafl, "srl": srl} if same else {"rafl": rafl})
+        return pd.DataFrame(rows, columns=COLUMNS)
+
+    def fine_tuning(self) -> pd.DataFrame:
+        """Fish-tails before and after going on with their own recordings."""
+        start = str((self.out / "runs" / "rafl").resolve())
+        rows: list[dict[str, Any]] = []
+        for shape in self.plan["fine_tuned"]:
+            if shape not in self.meshes:
+                continue
+            large = len(self.meshes[shape].vertices) >= LARGE
+            epochs = self.effort.fine_large if large else self.effort.fine
+            if not epochs:
+                continue
+            tuned = self.fit(f"fine-{shape}", "rafl", shape, epochs=epochs, start=start, force_penalty=0.0)
+            found = self.errors(shape, {"rafl-fine-tuned": tuned})
+            rows += [{**row, "shape": f"{shape}"} for row in found if row["method"] == "rafl-fine-tuned"]
+        return pd.DataFrame(rows, columns=COLUMNS)
+
+    def seconds(self) -> str:
+        """What each fit took."""
+        files = sorted((self.out / "runs").glob("*/seconds"))
+        return ", ".join(f"{file.parent.name} {float(file.read_text()):.0f} s" for file in files)
+
+
+def write_table(path: Path, table: pd.DataFrame, notes: list[str]) -> None:
+    header = "".join(f"# {note}\n" for note in notes)
+    with whole_file(path) as temporary:
+        temporary.write_text(header + table.to_csv(index=False, float_format="%.4f"))
+
+
+def show(title: str, table: pd.DataFrame) -> None:
+    printed = Table("shape", "method", "error [mm]", "paper [mm]", "", title=title)
+    for row in table.to_dict("records"):
+        known = np.isfinite(row["paper_mean_mm"])
+        paper = f"{row['paper_mean_mm']:.3f} +- {row['paper_std_mm']:.3f}" if known else ""
+        better = "at least as good" if known and row["mean_mm"] <= row["paper_mean_mm"] else ""
+        printed.add_row(row["shape"], row["method"], f"{row['mean_mm']:.3f} +- {row['std_mm']:.3f}", paper, better)
+    Console(width=110).print(printed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("studies", nargs="*", default=["vibration", "twist"])
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--large-epochs", type=int, help="of fine-tuning on the fine fish-tail; 0: none")
+    parser.add_argument("--out", type=Path, default=Path("build/paper"))
+    parser.add_argument("--results", type=Path, help="folder for the tables")
+    parser.add_argument("--tail-cells", type=Path, help="cells of the paper's own fine fish-tail, a boolean array")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    out = options.out / ("quick" if options.quick else "full")
+    results = options.results or out
+    fine: list[pd.DataFrame] = []
+    machine = f"{platform.machine()}, 2 threads at most, torch {torch.__version__}, seed {SEED}"
+    for name in options.studies:
+        effort = QUICK if options.quick else FULL
+        if options.large_epochs is not None:
+            effort = replace(effort, fine_large=options.large_epochs)
+        study = Study(name, out, effort, options.tail_cells)
+        table = study.table()
+        show(name, table)
+        write_table(results / f"{name}.csv", table, [machine, f"fits took {study.seconds()}"])
+        worse = table.pivot(index="shape", columns="method", values="mean_mm")
+        print(f"negative transfer: {int((worse['rafl'] > worse['original']).sum())} of {len(worse)} shapes")
+        tuned = study.fine_tuning()
+        show(f"{name}, fine-tuned", tuned)
+        fine.append(tuned.assign(study=name))
+        notes = [machine, f"{name}: fits took {study.seconds()}"]
+        write_table(results / "fine-tuning.csv", pd.concat(fine), notes)
+
+
+if __name__ == "__main__":
+    main()
