@@ -12,7 +12,16 @@ from rich.table import Table
 from groundwork import InputError, command_line, progress, user_command, write_text
 from rafl.dataset import Dataset, read_dataset
 from rafl.errors import SimulationError
-from rafl.evaluation import Comparison, compare, error_table, held_out_errors, split_table
+from rafl.evaluation import (
+    Comparison,
+    Transfer,
+    compare,
+    error_table,
+    held_out_errors,
+    latex_table,
+    motion_table,
+    split_table,
+)
 from rafl.fit import training_items
 from rafl.methods import EPOCHS, METHODS
 from rafl.report import write_report
@@ -154,13 +163,21 @@ def evaluate(
     recordings, splits = error_table(comparisons), split_table(comparisons)
     write_text(folder / "errors.csv", recordings.to_csv(index=False, float_format="%.6f"))
     described = "; ".join(f"{name}: {_described(model)}" for name, model in models.items())
-    write_report(folder / "report.html", comparisons, splits, recordings, described)
+    motions = motion_table(comparisons)
+    write_text(folder / "motions.csv", motions.to_csv(index=False, float_format="%.6f"))
+    write_text(folder / "errors.tex", latex_table(splits))
+    write_report(folder / "report.html", comparisons, splits, recordings, motions, described)
     table = Table("dataset", "split", "recordings", "method", "error [mm]")
     for row in splits.itertuples():
         value = f"{row.mean_mm:.3f} +- {row.std_mm:.3f}"
         table.add_row(str(row.dataset), str(row.split), str(row.recordings), str(row.method), value)
     Console(width=100).print(table)
-    typer.echo(f"wrote {folder / 'errors.csv'}")
+    transfer = Transfer.of(splits)
+    if transfer.errors.shape[1] > 1:
+        write_text(folder / "transfer.csv", transfer.errors.to_csv(float_format="%.6f"))
+    for name, count in transfer.negative.items():
+        typer.echo(f"{name}: worse than the original simulator on {count} of {transfer.errors.shape[1]} datasets")
+    typer.echo(f"wrote {folder}/errors.csv, motions.csv, errors.tex")
     held_out = held_out_errors(comparisons)
     if held_out:
         fitted = next(iter(models))
@@ -177,7 +194,16 @@ def _compare_all(datasets: list[Dataset], models: dict[str, FittedModel]) -> lis
     comparisons: list[Comparison] = []
     with progress() as bar:
         for dataset in bar.track(datasets, description="simulating"):
-            comparisons += compare(dataset, models)
+            fitting = dict(models)
+            for name, model in models.items():
+                try:
+                    model.residual(dataset.simulator)
+                except InputError as error:
+                    if len(datasets) == 1 and len(models) == 1:
+                        raise
+                    fitting.pop(name)
+                    typer.echo(f"left out on {dataset.name}: {error}", err=True)
+            comparisons += compare(dataset, fitting)
     return comparisons
 
 

@@ -54,14 +54,15 @@ class Recordings:
         self, residual: ResidualForce | None = None, parameters: Parameters | None = None
     ) -> tuple[Tensor, Tensor]:
         """Simulated markers (T, B, M, 3) [m] and residual forces (T - 1, B, N, 3) [N]."""
-        positions, forces = rollout(
-            self.dataset.simulator,
-            self.dataset.start(self.names),
-            len(self.markers) - 1,
-            residual,
-            parameters,
-        )
+        positions, forces = self.motion(residual, parameters)
         return self.dataset.markers.positions(positions), forces
+
+    def motion(
+        self, residual: ResidualForce | None = None, parameters: Parameters | None = None
+    ) -> tuple[Tensor, Tensor]:
+        """Simulated vertices (T, B, N, 3) [m] and residual forces (T - 1, B, N, 3) [N]."""
+        steps = len(self.markers) - 1
+        return rollout(self.dataset.simulator, self.dataset.start(self.names), steps, residual, parameters)
 
 
 def _usual_sigma(dataset: Dataset) -> float:

@@ -22,6 +22,7 @@ Array = NDArray[Any]
 
 RATE = 3e-3  # Adam's, at the start of the cosine decay
 BATCH = 16  # states an update
+PATIENCE = 3  # epochs that do not simulate better, after which the lesson is over
 LARGEST = 1000  # vertices: beyond, the body's compliance does not fit as a full matrix
 
 
@@ -146,6 +147,7 @@ def warm_start(
     batches = sum(lesson.states // BATCH for lesson in lessons)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(epochs * batches, 1), eta_min=0.01 * RATE)
     best, kept = judge(), {key: value.clone() for key, value in field.state_dict().items()}
+    vain = 0
     for epoch in range(epochs):
         total = 0.0
         turns = [
@@ -162,7 +164,10 @@ def warm_start(
             schedule.step()
             total += loss.item()
         error = judge()
+        report({"warm_start": epoch + 1, "missing": float(np.sqrt(total / len(turns))), "validation_mm": error})
+        vain = 0 if error < best else vain + 1
+        if vain == PATIENCE:
+            break
         if error < best:
             best, kept = error, {key: value.clone() for key, value in field.state_dict().items()}
-        report({"warm_start": epoch + 1, "missing": float(np.sqrt(total / len(turns))), "validation_mm": error})
     field.load_state_dict(kept)

@@ -185,9 +185,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("studies", nargs="*", default=["vibration", "twist"])
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument(
-        "--large-epochs", type=int, help="of fine-tuning on the fine fish-tail; 0: none, -1: leave it out"
-    )
+    parser.add_argument("--large-epochs", type=int, help="of fine-tuning the fine fish-tail; 0: none, -1: leave out")
     parser.add_argument("--out", type=Path, default=Path("build/paper"))
     parser.add_argument("--results", type=Path, help="folder for the tables")
     parser.add_argument("--tail-cells", type=Path, help="cells of the paper's own fine fish-tail, a boolean array")

@@ -1,11 +1,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch
 
 from rafl.dataset import Dataset
-from rafl.evaluation import compare, error_table, held_out_errors, split_table
+from rafl.evaluation import Transfer, compare, error_table, held_out_errors, latex_table, split_table
 from rafl.objective import Recordings, frame_errors, training_loss
 from rafl.run import FittedModel
 
@@ -58,3 +59,26 @@ def test_tables(dataset: Dataset) -> None:
     held_out = rows.query("recording == 'd' and method == 'original'")["mean_mm"].iloc[0]
     assert 1e3 * held_out_errors(comparisons)["original"] == pytest.approx(held_out)
     assert held_out > 0.3
+
+
+def test_transfer_counts_what_got_worse_and_latex_marks_it() -> None:
+    splits = pd.DataFrame(
+        [
+            {"dataset": d, "split": split, "recordings": n, "method": m, "mean_mm": mean, "std_mm": 0.1}
+            for d, split, n, values in (
+                ("thick", "test", 2, (1.0, 0.5, 2.0)),
+                ("thick", "train", 9, (9.0, 9.0, 9.0)),
+                ("thin", "train", 1, (2.0, 1.0, 1.0)),
+                ("thin", "val", 3, (4.0, 3.0, 9.0)),
+            )
+            for m, mean in zip(("original", "rafl", "sysid"), values, strict=True)
+        ]
+    )
+    transfer = Transfer.of(splits)
+    assert transfer.errors.loc["original"].tolist() == [1.0, 3.5]
+    assert transfer.errors.loc["sysid"].tolist() == [2.0, 7.0]
+    assert transfer.negative == {"rafl": 0, "sysid": 2}
+    text = latex_table(splits)
+    assert r"$\underline{\mathbf{0.500 \pm 0.100}}$" in text
+    assert r"$2.000 \pm 0.100$" in text
+    assert "9.000" not in text
