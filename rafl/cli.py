@@ -24,6 +24,7 @@ from rafl.evaluation import (
 )
 from rafl.fit import training_items
 from rafl.methods import EPOCHS, METHODS
+from rafl.processes import rank
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
 from rafl.sysid import spoken
@@ -89,7 +90,9 @@ def fit(
     if start is not None:
         load_model(start)
     training_items(loaded)  # refused before anything is written
-    _open_run(run, settings, resume)
+    first = rank() == 0  # of the processes that torchrun started
+    if first:
+        _open_run(run, settings, resume)
     with progress() as bar:
         task = bar.add_task("epoch", total=epochs)
 
@@ -98,12 +101,16 @@ def fit(
             bar.update(task, completed=row.get("epoch", 0))
             values = ", ".join(f"{key} {value:.5g}" for key, value in row.items() if key != kind)
             label = kind.replace("_", " ")
+            if not first:
+                return
             bar.console.print(f"{label} {row[kind]:3.0f}: {values}", highlight=False, soft_wrap=True)
 
         try:
             model = METHODS[method](loaded, settings, run, report)
         except SimulationError as error:
             raise _simulating(error) from None
+    if not first:
+        return
     typer.echo(_described(model))
     if (run / "parameters.csv").exists():
         for line in spoken(pd.read_csv(run / "parameters.csv")):

@@ -56,6 +56,11 @@ class Processes:
             dist.barrier()
 
 
+def rank() -> int:
+    """This process's number among those that torchrun started; 0 where it started none."""
+    return int(os.environ.get("RANK", "0"))
+
+
 @contextmanager
 def processes() -> Iterator[Processes]:
     """Those that torchrun started, or this one alone."""
@@ -65,6 +70,6 @@ def processes() -> Iterator[Processes]:
         return
     dist.init_process_group("gloo")
     try:
-        yield Processes(dist.get_rank(), count)
+        yield Processes(rank(), count)
     finally:
         dist.destroy_process_group()
