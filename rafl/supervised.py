@@ -17,6 +17,7 @@ from rafl.targets import residual_targets
 STATES = 256  # an update
 RATE = 1e-3  # Adam's, at the start of the cosine decay
 JUDGED = 25  # epochs between rollouts of the validation recordings
+PATIENCE = 8  # of these without gain end the training
 PENALTY = 1e-4  # lambda_1 of the targets [m^2/N^2]
 TARGETS = "targets.pt"
 
@@ -50,7 +51,7 @@ def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, repor
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs, eta_min=0.01 * RATE)
     history = [{"epoch": 0, "loss": math.nan, "validation_mm": 1e3 * mean_error(validate, FittedModel("original"))}]
     report(history[-1])
-    best = math.inf
+    best, vain = math.inf, 0
     for epoch in range(1, settings.epochs + 1):
         total = 0.0
         chosen_batches = torch.randperm(len(states)).split(STATES)
@@ -65,11 +66,14 @@ def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, repor
             continue
         error = 1e3 * mean_error(validate, model)
         history.append({"epoch": epoch, "loss": total, "validation_mm": error})
+        vain = 0 if error < best else vain + 1
         if error < best or not (run / "model.pt").exists():
             best = min(best, error)
             save_model(run, model)
         write_history(run, history)
         report(history[-1])
+        if vain == PATIENCE:
+            break
     return load_model(run)
 
 
