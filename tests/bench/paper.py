@@ -34,6 +34,7 @@ from rafl.synthetic import hung, released, twisted, with_material
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
 SEED = 0
 LARGE = 1000  # vertices: such a shape is fine-tuned for fewer epochs, and left out by --quick
+BEAMS = ("canonical", "longer", "shorter", "thicker", "thinner")
 COLUMNS = ["shape", "method", "mean_mm", "std_mm", "paper_mean_mm", "paper_std_mm"]
 
 
@@ -44,10 +45,11 @@ class Effort:
     rafl: int
     srl: int
     fine: int
+    left_out: int
     fine_large: int | None  # None leaves large shapes out, 0 only evaluates there
 
 
-FULL, QUICK = Effort(100, 1000, 60, 4), Effort(20, 150, 8, None)
+FULL, QUICK = Effort(100, 1000, 60, 30, 4), Effort(20, 150, 8, 5, None)
 
 
 def mesh_of(shape: dict[str, Any]) -> HexMesh:
@@ -99,13 +101,20 @@ class Study:
             write_dataset(path, released(shape, base, target, starts, self.plan["frames"], names, self.name))
         return read_dataset(path)
 
-    def fit(self, run: str, method: str, shape: str, **changes: Any) -> FittedModel:
+    def few(self, shape: str) -> Dataset:
+        """Two training recordings and one to validate by."""
+        dataset = self.dataset(shape, "train", "val")
+        names = dataset.split("train")[:: len(dataset.split("train")) // 2][:2] + dataset.split("val")[:1]
+        return replace(dataset, trajectories={name: dataset.trajectories[name] for name in names})
+
+    def fit(self, run: str, method: str, datasets: list[Dataset], **changes: Any) -> FittedModel:
         """A model, fitted where it is not yet; how long that took stands in its folder."""
         folder = self.out / "runs" / run
         if not (folder / "seconds").exists():
-            dataset = self.dataset(shape, "train", "val")
             epochs = changes.pop("epochs")
-            settings = Settings(method, (shape,), epochs, 2e-3, 1e-5, epochs, 0, SEED, **changes)
+            settings = Settings(
+                method, tuple(item.name for item in datasets), epochs, 2e-3, 1e-5, epochs, 0, SEED, **changes
+            )
             write_settings(folder, settings)
             begun = time.perf_counter()
 
@@ -113,7 +122,7 @@ class Study:
                 words = ", ".join(f"{key} {value:.4g}" for key, value in row.items())
                 print(f"{self.name} {run}: {words}, {time.perf_counter() - begun:.0f} s", flush=True)
 
-            METHODS[method]([dataset], settings, folder, report)
+            METHODS[method](datasets, settings, folder, report)
             write_text(folder / "seconds", f"{time.perf_counter() - begun:.1f}\n")
         return load_model(folder)
 
@@ -135,8 +144,9 @@ class Study:
     def table(self) -> pd.DataFrame:
         """Every shape by every method that works on it."""
         trained = self.plan["trained_on"]
-        rafl = self.fit("rafl", "rafl", trained, epochs=self.effort.rafl, batch=1, force_penalty=1e-6, warm_start=12)
-        srl = self.fit("srl", "srl", trained, epochs=self.effort.srl)
+        own = [self.dataset(trained, "train", "val")]
+        rafl = self.fit("rafl", "rafl", own, epochs=self.effort.rafl, batch=1, force_penalty=1e-6, warm_start=12)
+        srl = self.fit("srl", "srl", own, epochs=self.effort.srl)
         rows: list[dict[str, Any]] = []
         for shape, mesh in self.meshes.items():
             same = len(mesh.vertices) == len(self.meshes[trained].vertices)
@@ -154,9 +164,19 @@ class Study:
             epochs = self.effort.fine_large if large else self.effort.fine
             if not epochs:
                 continue
-            tuned = self.fit(f"fine-{shape}", "rafl", shape, epochs=epochs, start=start, force_penalty=0.0)
+            own = [self.dataset(shape, "train", "val")]
+            tuned = self.fit(f"fine-{shape}", "rafl", own, epochs=epochs, start=start, force_penalty=0.0)
             found = self.errors(shape, {"rafl-fine-tuned": tuned})
             rows += [{**row, "shape": f"{shape}"} for row in found if row["method"] == "rafl-fine-tuned"]
+        return pd.DataFrame(rows, columns=COLUMNS)
+
+    def leave_one_out(self) -> pd.DataFrame:
+        """Each beam shape by a model of two recordings of each of the four others."""
+        rows: list[dict[str, Any]] = []
+        for shape in BEAMS:
+            others = [self.few(other) for other in BEAMS if other != shape]
+            model = self.fit(f"without-{shape}", "rafl", others, epochs=self.effort.left_out, warm_start=12)
+            rows += [{**row, "paper_mean_mm": np.nan} for row in self.errors(shape, {"rafl-of-the-others": model})]
         return pd.DataFrame(rows, columns=COLUMNS)
 
     def seconds(self) -> str:
@@ -207,6 +227,10 @@ def main() -> None:
         print(f"negative transfer: {int((worse['rafl'] > worse['original']).sum())} of {len(worse)} shapes")
         tuned = study.fine_tuning()
         show(f"{name}, fine-tuned", tuned)
+        if name == "vibration":
+            left_out = study.leave_one_out()
+            show(f"{name}, each shape by the four others", left_out)
+            write_table(results / "leave-one-shape-out.csv", left_out, [machine, f"fits took {study.seconds()}"])
         fine.append(tuned.assign(study=name))
         notes = [machine, f"{name}: fits took {study.seconds()}"]
         write_table(results / "fine-tuning.csv", pd.concat(fine), notes)
