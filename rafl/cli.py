@@ -24,7 +24,7 @@ from rafl.evaluation import (
 )
 from rafl.fit import training_items
 from rafl.methods import EPOCHS, METHODS
-from rafl.processes import rank
+from rafl.processes import process_count, rank
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
 from rafl.sysid import spoken
@@ -61,7 +61,7 @@ def fit(
     patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping (rafl).")] = 20,
     frames: Annotated[int, typer.Option(min=0, help="Leading frames to train on (0: all).")] = 0,
     seed: Annotated[int, typer.Option(help="Of weights and order (rafl).")] = 0,
-    batch: Annotated[int, typer.Option(min=1, help="Recordings an update (rafl); torchrun shares them out.")] = 2,
+    batch: Annotated[int, typer.Option(min=1, help="Recordings an update (rafl); torchrun shares them out.")] = 1,
     force_penalty: Annotated[float, typer.Option(min=0.0, help="On squared residual forces [m2/N2] (rafl).")] = 1e-8,
     warm_start: Annotated[
         int, typer.Option(min=0, help="Passes over the equations of motion first, where every vertex is seen (rafl).")
@@ -93,6 +93,8 @@ def fit(
     first = rank() == 0  # of the processes that torchrun started
     if first:
         _open_run(run, settings, resume)
+        if process_count() > batch:
+            typer.echo(f"{process_count()} processes share out {batch}: give --batch to use them all", err=True)
     with progress() as bar:
         task = bar.add_task("epoch", total=epochs)
 
