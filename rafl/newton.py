@@ -13,6 +13,7 @@ from rafl.resistance import Resistance
 Array = NDArray[Any]
 
 LONGEST = 0.3  # of an edge: what one step may change it by, lest the body snap through to another equilibrium
+TORN = 30.0  # of an edge: what nobody need try to follow
 TOLERANCE = 1e-10  # largest nodal residual accepted [N]
 ROUNDING = 8.0 * np.finfo(float).eps  # relative error allowed for in positions
 MAX_ITERATIONS = 200
@@ -52,6 +53,12 @@ def minimise(
     Raises:
         SimulationError: no convergence; names trajectory, residual and what to try.
     """
+    torn = engine.mesh.stretching(start - engine.mesh.vertices)
+    if not (torn < TORN).all():
+        raise SimulationError(
+            f"{what}: trajectory {int(np.argmax(torn))} is torn apart (an edge changed by {torn.max():.3g} times its "
+            "length); the forces are not those of this body"
+        )
     problem = (engine, start, inertia, target, force, resistance, what, factors or engine.allocate(len(start)))
     try:
         return _descend(*problem, LONGEST)
