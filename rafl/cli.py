@@ -22,8 +22,7 @@ from rafl.evaluation import (
     motion_table,
     split_table,
 )
-from rafl.fit import training_items
-from rafl.methods import EPOCHS, METHODS
+from rafl.methods import EPOCHS, METHODS, check_inputs
 from rafl.processes import process_count, rank
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
@@ -75,21 +74,17 @@ def fit(
     Example: rafl-fit datasets/thick.h5 --out runs/thick
     """
     torch.set_num_threads(TORCH_THREADS)
-    if method not in METHODS:
-        raise InputError(f"--method: expected {', '.join(METHODS)}, found {method!r}")
     if frames == 1:
         raise InputError("--frames: expected 0 (all) or at least 2, found 1")
     loaded = [read_dataset(path) for path in datasets]
     run = out or Path("runs") / f"{loaded[0].name}-{method}"
+    check_inputs(method, loaded, start)
     epochs = epochs or EPOCHS[method]
     settings = Settings(
         method, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
         weight_decay, patience, frames, seed, batch, force_penalty, warm_start if start is None else 0,
         str(start.resolve()) if start else "", by_sigma,
     )  # fmt: skip
-    if start is not None:
-        load_model(start)
-    training_items(loaded)  # refused before anything is written
     first = rank() == 0  # of the processes that torchrun started
     if first:
         _open_run(run, settings, resume)

@@ -101,6 +101,18 @@ def mean_error(sets: list[Recordings], model: FittedModel) -> float:
     return float(np.concatenate(errors).mean())
 
 
+def field_of(run: Path) -> ResidualField:
+    """The field that an earlier run trained.
+
+    Raises:
+        InputError: no run there, or one of another method.
+    """
+    model = load_model(run)
+    if model.field is None:
+        raise InputError(f"expected a run of method rafl in {run} to go on from, found {model.method}")
+    return model.field
+
+
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
     """Train a `ResidualField` by Adam, one step per batch of recordings; the best on the validation set is kept.
 
@@ -145,10 +157,7 @@ class _Training:
 
     def _first_field(self, datasets: list[Dataset]) -> ResidualField:
         if self.settings.start:
-            field = load_model(Path(self.settings.start)).field
-            if field is None:
-                raise InputError(f"expected a run of method rafl in {self.settings.start} to go on from, found another")
-            return field
+            return field_of(Path(self.settings.start))
         field = ResidualField()
         if not (self.run / CHECKPOINT).exists():
             field.scale_to([_sample_features(dataset) for dataset in datasets if dataset.split("train")])

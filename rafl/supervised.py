@@ -33,17 +33,12 @@ def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, repor
         SimulationError: the recordings cannot be followed.
     """
     cut = [shortened(dataset, settings.frames) for dataset in datasets]
-    counts = {len(dataset.simulator.mesh.vertices) for dataset in cut}
-    if len(counts) > 1:
-        raise InputError(
-            f"srl: expected datasets of one mesh, found {', '.join(str(n) for n in sorted(counts))} vertices; train "
-            "one model each, or use method rafl"
-        )
+    nodes = one_mesh(cut)
     training_items(cut)
     validate = validation_batches(cut)
     states, forces = _lessons(cut, run)
     torch.manual_seed(settings.seed)
-    network = GlobalResidual(counts.pop())
+    network = GlobalResidual(nodes)
     network.normalise(states, forces)
     wanted = (forces - network.force_mean) / network.force_size
     model = FittedModel("srl", network=network)
@@ -75,6 +70,21 @@ def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, repor
         if vain == PATIENCE:
             break
     return load_model(run)
+
+
+def one_mesh(datasets: list[Dataset]) -> int:
+    """The number of vertices that all datasets share.
+
+    Raises:
+        InputError: they do not.
+    """
+    counts = {len(dataset.simulator.mesh.vertices) for dataset in datasets}
+    if len(counts) > 1:
+        raise InputError(
+            f"srl: expected datasets of one mesh, found {', '.join(str(n) for n in sorted(counts))} vertices; train "
+            "one model each, or use method rafl"
+        )
+    return counts.pop()
 
 
 def _lessons(datasets: list[Dataset], run: Path) -> tuple[Tensor, Tensor]:

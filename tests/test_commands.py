@@ -15,6 +15,7 @@ from capture.build import CaptureSettings, RecordingRow, build_dataset
 from capture.motion import tip_load_release
 from capture.specimen import Specimen
 from rafl.dataset import Dataset, write_dataset
+from rafl.mesh import HexMesh
 
 COMMANDS = ("rafl-render", "rafl-calibrate", "rafl-track", "rafl-capture", "rafl-fit", "rafl-eval")
 
@@ -228,3 +229,23 @@ def test_render_refuses(specimen_file: Path, run: Run, tmp_path: Path) -> None:
     (tmp_path / "film").mkdir()
     (tmp_path / "film" / "thesis.txt").write_text("mine")
     assert_refused(run("rafl-render", specimen_file, "--out", "film"), "found files in it")
+
+
+def test_what_a_method_cannot_be_fitted_to_is_refused_before_anything_is_written(
+    built: Dataset, run: Run, tmp_path: Path
+) -> None:
+    mesh = HexMesh.box((3, 2, 2), (0.03, 0.02, 0.02))
+    other = replace(built.simulator, mesh=mesh, fixed=mesh.face_nodes("x-min"))
+    grown = {
+        name: replace(
+            item, **{key: np.zeros((36, *getattr(item, key).shape[1:])) for key in ("q", "v", "virtual_force")}
+        )
+        for name, item in built.trajectories.items()
+    }
+    grown = {name: replace(item, load=item.q, added_mass=item.q[:, 0]) for name, item in grown.items()}
+    write_dataset(tmp_path / "a.h5", built)
+    write_dataset(tmp_path / "b.h5", replace(built, simulator=other, trajectories=grown))
+    assert_refused(run("rafl-fit", "a.h5", "b.h5", "--method", "srl", "--out", "run"), "srl", "one mesh", "36")
+    assert_refused(run("rafl-fit", "a.h5", "--method", "magic", "--out", "run"), "--method", "sysid-e", "magic")
+    assert_refused(run("rafl-fit", "a.h5", "--from", "nowhere", "--out", "run"), "nowhere", "check the path")
+    assert not (tmp_path / "run").exists()
