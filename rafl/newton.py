@@ -53,17 +53,18 @@ def minimise(
     Raises:
         SimulationError: no convergence; names trajectory, residual and what to try.
     """
-    torn = engine.mesh.stretching(start - engine.mesh.vertices)
+    problem = (engine, start, inertia, target, force, resistance, what, factors or engine.allocate(len(start)))
+    try:
+        found = _descend(*problem, LONGEST)
+    except SimulationError:
+        found = _descend(*problem, np.inf)  # from a start so squeezed that only a leap leads out
+    torn = engine.mesh.stretching(found - engine.mesh.vertices)
     if not (torn < TORN).all():
         raise SimulationError(
             f"{what}: trajectory {int(np.argmax(torn))} is torn apart (an edge changed by {torn.max():.3g} times its "
             "length); the forces are not those of this body"
         )
-    problem = (engine, start, inertia, target, force, resistance, what, factors or engine.allocate(len(start)))
-    try:
-        return _descend(*problem, LONGEST)
-    except SimulationError:
-        return _descend(*problem, np.inf)  # from a start so squeezed that only a leap leads out
+    return found
 
 
 def _descend(
