@@ -58,5 +58,5 @@ def test_from_a_filmed_specimen_to_a_fitted_model(specimen_file: Path, run: Run,
     assert set(errors["method"]) == {"original", "rafl", "sysid"}
     assert len(errors) == 9
     page = (tmp_path / "result/report.html").read_text()
-    assert page.count("<img") == 4
+    assert page.count("<img") == 6  # errors, markers, bodies and forces
     assert "http" not in page.replace("data:image/png;base64", "")

@@ -102,13 +102,13 @@ def test_the_stated_uncertainty_is_the_actual_one(dataset: Dataset, tmp_path: Pa
     """Over noisy copies of the recordings E scatters as its interval says; E and nu trade off, and it is said."""
     random = np.random.default_rng(3)
     found, widths = [], []
-    for k in range(8):
+    for k in range(5):
         noisy = {
             name: replace(item, markers=item.markers + random.normal(0, 2e-4, item.markers.shape))
             for name, item in dataset.trajectories.items()
         }
         run = tmp_path / str(k)
-        settings = replace(SETTINGS, method="sysid-e", epochs=12, frames=12)
+        settings = replace(SETTINGS, method="sysid-e", epochs=6, frames=8)
         model = identify_material([replace(dataset, trajectories=noisy)], settings, run, silent)
         assert model.material is not None
         assert model.material["poissons_ratio"] == 0.499
@@ -134,7 +134,7 @@ def test_trading_off_is_said() -> None:
 
 def test_supervised_residuals(dataset: Dataset, tmp_path: Path) -> None:
     """The targets follow the recordings, the network learns them, and another mesh is refused by name."""
-    settings = replace(SETTINGS, method="srl", epochs=150, frames=0)
+    settings = replace(SETTINGS, method="srl", epochs=75, frames=0)
     recordings = Recordings.of(dataset, ["a", "b"])
     targets = residual_targets(recordings, 1e-8)
     assert np.sqrt(targets.objective.mean() / 20) < 2e-5

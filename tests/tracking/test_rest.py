@@ -7,12 +7,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import ROOT, Run, assert_refused
+from typer.testing import CliRunner
 
 from calibration.camera import OrthographicCamera
 from calibration.rest import camera_from_points
 from calibration.rig import read_rig
 from groundwork import InputError
 from tracking.artificial import Scene, draw, expose
+from tracking.cli import calibrate_app
 from tracking.layout import read_layout
 
 SPECIMEN = ROOT / "datasets/specimens/canonical.yaml"
@@ -73,14 +75,19 @@ def test_two_cameras_that_each_see_one_face(run: Run, tmp_path: Path) -> None:
 def test_what_rest_cannot_tell_is_refused(run: Run, tmp_path: Path) -> None:
     film(tmp_path / "still/left.mkv", camera("y-min", [0.0, 0.0, 0.0]), "y-min")
     film(tmp_path / "moving/left.mkv", camera("y-min", [0.0, 0.0, 0.0]), "y-min", shift=6.0)
-    rest = ["--from-rest", "still", "--specimen", SPECIMEN]
+    rest = ["--from-rest", tmp_path / "still", "--specimen", SPECIMEN]
     assert_refused(run("rafl-calibrate", *rest), "camera left", "y-min, y-max alike", "--face left=y-min")
-    assert_refused(run("rafl-calibrate", "--from-rest", "moving", *rest[2:]), "left.mkv", "at rest", "move by")
-    assert_refused(run("rafl-calibrate", *rest, "--face", "left=front"), "--face", "y-min", "left=front")
-    assert_refused(run("rafl-calibrate", *rest, "--face", "left=x-max"), "left.mkv", "x-max")
-    assert_refused(run("rafl-calibrate", *rest[:2]), "--specimen")
-    assert_refused(run("rafl-calibrate", "--from-rest", "nowhere", *rest[2:]), "nowhere")
-    assert_refused(run("rafl-calibrate"), "--from-rest")
+    for given, words in (
+        (["--from-rest", tmp_path / "moving", *rest[2:]], ("left.mkv", "at rest", "move by")),
+        ([*rest, "--face", "left=front"], ("--face", "y-min", "left=front")),
+        ([*rest, "--face", "left=x-max"], ("left.mkv", "x-max")),
+        (rest[:2], ("--specimen",)),
+        (["--from-rest", tmp_path / "nowhere", *rest[2:]], ("nowhere",)),
+        ([], ("--from-rest",)),
+    ):
+        result = CliRunner().invoke(calibrate_app, [*map(str, given)])
+        assert result.exit_code == 2
+        assert all(word in result.stderr for word in words), result.stderr
 
 
 @pytest.mark.parametrize("seed", range(20))
