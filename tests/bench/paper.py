@@ -245,6 +245,9 @@ def main() -> None:
     out = options.out / ("quick" if options.quick else "full")
     results = options.results or out
     fine: list[pd.DataFrame] = []
+    if (results / "fine-tuning.csv").exists():
+        earlier = pd.read_csv(results / "fine-tuning.csv", comment="#")
+        fine.append(earlier[~earlier["study"].isin(options.studies)])
     machine = f"{platform.machine()}, 2 threads at most, torch {torch.__version__}, seed {SEED}"
     if options.time_to_accuracy:
         time_to_accuracy(Study("vibration", out, QUICK, None))
