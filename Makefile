@@ -58,7 +58,7 @@ bench-simulator: install
 bench-tracking: install
 	$(BIN)/python tests/bench/tracker.py $(if $(SEED),--seed $(SEED)) $(if $(wildcard $(SHARED)/real/clamped_beam),--real $(SHARED)/real/clamped_beam)
 
-# The paper's sim-to-sim studies, hours: make bench-paper; QUICK=1 in 20 minutes. Resumable.
+# The paper's sim-to-sim studies, hours: make bench-paper; QUICK=1 for a short form. Resumable.
 bench-paper: install
 	$(BIN)/python tests/bench/paper.py $(if $(QUICK),--quick,--results datasets/results) $(if $(wildcard $(TAIL)),--tail-cells $(TAIL))
 

@@ -24,6 +24,7 @@ Array = NDArray[Any]
 FEWEST_POINTS = 6
 FLAT = 0.02  # of the points' extent: what stands out of a plane by less counts as lying in it
 PLAIN = 9.2  # how much better, in variances of a residual, a tilted camera must explain the points than a square one
+UNSEEN = 3.0  # residuals by which a tilt must shorten a face to be noticed
 OUTLYING = 2.5  # standard deviations from which a point counts less
 
 
@@ -86,7 +87,8 @@ def camera_from_points(
         square = _Fit.of(points - middle, pixels, _square_on(likely[0].turn.as_matrix(), face[2]), tilted=False)
         freedom = 2 * len(points) - 6
         if square.size**2 < best**2 * (1.0 + PLAIN / freedom):
-            unsure = float(np.sqrt(2.0 * 3.0 * square.size / (square.values[0] * extent[1])))
+            # A tilt t shortens the face by t^2 / 2 of its extent: fewer residuals than these go unseen.
+            unsure = float(np.sqrt(2.0 * UNSEEN * square.size / (square.values[0] * extent[1])))
             likely = [square]
     if len(likely) > 1:
         edges = [farther_edge(fit.turn.as_matrix() @ face.T) for fit in likely]

@@ -11,12 +11,12 @@ import pydantic
 from numpy.typing import NDArray
 
 from capture.initial import fit_first_frame
-from capture.motion import tip_force
 from capture.registration import IDENTITY, Rigid, rigid_fit
 from capture.sources import Recorded, find_source, read_recorded
 from capture.specimen import Specimen
 from groundwork import InputError, StrictModel, require_file
 from rafl.dataset import Dataset, Trajectory
+from rafl.synthetic import load_force
 
 Array = NDArray[Any]
 
@@ -147,7 +147,7 @@ def build_dataset(
             initial.q,
             np.zeros_like(initial.q),
             initial.force,
-            tip_force(specimen, load),
+            load_force(simulator, specimen.loaded, load),
             added,
             row.split,
             {

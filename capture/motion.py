@@ -4,13 +4,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from capture.specimen import Specimen
 from rafl.material import Material
-from rafl.rollout import Start, rollout
-from rafl.simulator import GRAVITY, Simulator
+from rafl.simulator import Simulator
+from rafl.synthetic import hung, let_go, twisted
 
 Array = NDArray[Any]
 
@@ -32,40 +31,20 @@ class Motion:
     q: Array
 
 
-def tip_force(specimen: Specimen, load: float) -> Array:
-    """Nodal forces [N], (N, 3), of a load [kg] shared by the loaded nodes."""
-    force = np.zeros_like(specimen.mesh.vertices)
-    force[specimen.loaded] = load * np.asarray(GRAVITY) / len(specimen.loaded)
-    return force
-
-
 def tip_load_release(specimen: Specimen, material: Material, load: float, frames: int, fps: float) -> Motion:
     """Released from rest under a tip load [kg]."""
     simulator = specimen.simulator(1.0 / fps, material)
-    q = simulator.equilibrium((simulator.weight + tip_force(specimen, load))[None])
-    return _released(f"load{1e3 * load:03.0f}g", load, simulator, q, frames)
+    starts = hung(simulator, specimen.loaded, np.array([load]))
+    return _motion(f"load{1e3 * load:03.0f}g", load, simulator, starts, frames)
 
 
 def twist_release(specimen: Specimen, material: Material, angle: float, frames: int, fps: float) -> Motion:
     """Released from a twist about the x axis, growing linearly to `angle` [rad] at the tip."""
-    vertices = specimen.mesh.vertices
-    x = vertices[:, 0] / np.ptp(vertices[:, 0])
-    centre = 0.5 * (vertices.min(0) + vertices.max(0))
-    y, z = (vertices - centre)[:, 1:].T
-    cos, sin = np.cos(angle * x), np.sin(angle * x)
-    q = np.stack([vertices[:, 0], centre[1] + cos * y - sin * z, centre[2] + sin * y + cos * z], axis=1)
+    simulator = specimen.simulator(1.0 / fps, material)
     name = f"twist{np.degrees(angle):03.0f}deg"
-    return _released(name, 0.0, specimen.simulator(1.0 / fps, material), q[None], frames)
+    return _motion(name, 0.0, simulator, twisted(specimen.mesh, np.array([angle])), frames)
 
 
-def _released(name: str, load: float, simulator: Simulator, q: Array, frames: int) -> Motion:
-    start = Start(
-        torch.from_numpy(q),
-        torch.zeros(q.shape, dtype=torch.float64),
-        torch.zeros(q.shape, dtype=torch.float64),
-        torch.zeros(q.shape[:2], dtype=torch.float64),
-        (name,),
-    )
-    with torch.no_grad():
-        positions, _ = rollout(simulator, start, frames - 1)
-    return Motion(name, load, simulator.time_step * np.arange(frames), positions[:, 0].numpy())
+def _motion(name: str, load: float, simulator: Simulator, starts: Array, frames: int) -> Motion:
+    time = simulator.time_step * np.arange(frames)
+    return Motion(name, load, time, let_go(simulator, starts, frames, (name,))[:, 0])

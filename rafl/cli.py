@@ -56,17 +56,19 @@ def fit(
         int | None, typer.Option(min=1, help="Passes over the recordings (iterations of sysid), at most [by method].")
     ] = None,
     learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start (rafl).")] = 5e-3,
-    weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's (rafl).")] = 1e-5,
+    weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's (rafl, srl).")] = 1e-5,
     patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping (rafl).")] = 20,
     frames: Annotated[int, typer.Option(min=0, help="Leading frames to train on (0: all).")] = 0,
-    seed: Annotated[int, typer.Option(help="Of weights and order (rafl).")] = 0,
+    seed: Annotated[int, typer.Option(help="Of weights and order (rafl, srl).")] = 0,
     batch: Annotated[int, typer.Option(min=1, help="Recordings an update (rafl); torchrun shares them out.")] = 1,
     force_penalty: Annotated[float, typer.Option(min=0.0, help="On squared residual forces [m2/N2] (rafl).")] = 1e-8,
     warm_start: Annotated[
         int, typer.Option(min=0, help="Passes over the equations of motion first, where every vertex is seen (rafl).")
     ] = 12,
     start: Annotated[Path | None, typer.Option("--from", help="Run to fine-tune (rafl).")] = None,
-    by_sigma: Annotated[bool, typer.Option("--by-sigma", help="Markers count by their uncertainty.")] = False,
+    by_sigma: Annotated[
+        bool, typer.Option("--by-sigma", help="Weigh markers by their uncertainty (rafl, sysid).")
+    ] = False,
     resume: Annotated[bool, typer.Option(help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Train on the `train` recordings, watch the `val` ones, keep the best.
@@ -180,35 +182,46 @@ def evaluate(
     if transfer.errors.shape[1] > 1:
         write_text(folder / "transfer.csv", transfer.errors.to_csv(float_format="%.6f"))
     for name, count in transfer.negative.items():
-        typer.echo(f"{name}: worse than the original simulator on {count} of {transfer.errors.shape[1]} datasets")
+        typer.echo(f"{name}: worse than the original simulator on {count} of {transfer.tried[name]} datasets")
     typer.echo(f"wrote {folder}/errors.csv, motions.csv, errors.tex")
     held_out = held_out_errors(comparisons)
     if held_out:
-        fitted = next(iter(models))
-        typer.echo(
-            f"held-out marker error: original {1e3 * held_out['original']:.3f} mm, "
-            f"fitted {1e3 * held_out[fitted]:.3f} mm"
-        )
+        values = ", ".join(f"{name} {1e3 * error:.3f} mm" for name, error in held_out.items())
+        typer.echo(f"held-out marker error: {values}")
     else:
         typer.echo("no recording has split `test`: nothing was held out", err=True)
     typer.echo(f"report: {folder / 'report.html'} (open it in a browser)")
 
 
 def _compare_all(datasets: list[Dataset], models: dict[str, FittedModel]) -> list[Comparison]:
+    fitting = _acting(datasets, models)
     comparisons: list[Comparison] = []
     with progress() as bar:
-        for dataset in bar.track(datasets, description="simulating"):
-            fitting = dict(models)
-            for name, model in models.items():
-                try:
-                    model.residual(dataset.simulator)
-                except InputError as error:
-                    if len(datasets) == 1 and len(models) == 1:
-                        raise
-                    fitting.pop(name)
-                    typer.echo(f"left out on {dataset.name}: {error}", err=True)
-            comparisons += compare(dataset, fitting)
+        for k, dataset in enumerate(bar.track(datasets, description="simulating")):
+            comparisons += compare(dataset, fitting[k])
     return comparisons
+
+
+def _acting(datasets: list[Dataset], models: dict[str, FittedModel]) -> list[dict[str, FittedModel]]:
+    """The models that act on each dataset; says which are left out.
+
+    Raises:
+        InputError: a model that acts on none.
+    """
+    fitting = [dict(models) for _ in datasets]
+    for name, model in models.items():
+        left_out = {}
+        for dataset, own in zip(datasets, fitting, strict=True):
+            try:
+                model.residual(dataset.simulator)
+            except InputError as error:
+                left_out[dataset.name] = error
+                own.pop(name)
+        if len(left_out) == len(datasets):
+            raise next(iter(left_out.values()))
+        for where, reason in left_out.items():
+            typer.echo(f"left out on {where}: {reason}", err=True)
+    return fitting
 
 
 def _named_models(runs: list[Path]) -> dict[str, FittedModel]:

@@ -163,10 +163,12 @@ class Transfer:
     Attributes:
         errors: mean errors [mm] of the test recordings (of all, where a dataset has none), a row a method.
         negative: by fitted method, on how many datasets it is worse than the untouched simulator.
+        tried: by fitted method, on how many datasets it acts.
     """
 
     errors: pd.DataFrame
     negative: dict[str, int]
+    tried: dict[str, int]
 
     @classmethod
     def of(cls, splits: pd.DataFrame) -> "Transfer":
@@ -180,7 +182,9 @@ class Transfer:
         errors = errors.loc[list(dict.fromkeys(splits["method"])), list(dict.fromkeys(splits["dataset"]))]
         fitted = errors.drop(index=ORIGINAL)
         worse = fitted.gt(errors.loc[ORIGINAL], axis="columns").sum(axis=1)
-        return cls(errors, {str(method): int(count) for method, count in worse.items()})
+        tried = fitted.notna().sum(axis=1)
+        negative, acting = ({str(method): int(n) for method, n in counts.items()} for counts in (worse, tried))
+        return cls(errors, negative, acting)
 
 
 def latex_table(splits: pd.DataFrame) -> str:
@@ -206,12 +210,11 @@ def latex_table(splits: pd.DataFrame) -> str:
 
 
 def held_out_errors(comparisons: list[Comparison]) -> dict[str, float]:
-    """Mean error [m] by method over the test recordings of all datasets; empty without any."""
+    """Mean error [m] over the test recordings of all datasets, by method that acts on them all; empty without any."""
     chosen = [item for item in comparisons if item.split == "test"]
-    if not chosen:
-        return {}
     methods = dict.fromkeys(method for item in chosen for method in item.errors)
     return {
-        method: float(np.concatenate([item.errors[method] for item in chosen if method in item.errors]).mean())
+        method: float(np.concatenate([item.errors[method] for item in chosen]).mean())
         for method in methods
+        if all(method in item.errors for item in chosen)
     }

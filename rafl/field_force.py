@@ -1,5 +1,6 @@
 """The residual field's nodal force as one differentiable step: compiled features, the network, compiled sums."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +50,14 @@ class FieldPoints:
         return inputs, kept
 
 
+def accelerations(inputs: Tensor, weights: Sequence[Tensor]) -> list[Tensor]:
+    """Inputs (34, P) and what each layer makes of them; the last are co-rotated accelerations (3, P) [m/s^2]."""
+    layers = [inputs]
+    for weight in weights[:-1]:
+        layers.append(torch.nn.functional.elu(weight @ layers[-1], inplace=True))
+    return [*layers, weights[-1] @ layers[-1]]
+
+
 class FieldForce(torch.autograd.Function):
     """Nodal forces (B, N, 3) [N] of states q, v (B, N, 3) under a network's weights, the features' scale in the first.
 
@@ -59,10 +68,8 @@ class FieldForce(torch.autograd.Function):
     def forward(ctx: Any, q: Tensor, v: Tensor, points: FieldPoints, *weights: Tensor) -> Tensor:  # type: ignore[override]
         """Evaluate."""
         inputs, kept = points.features(*(np.ascontiguousarray(x.detach().numpy()) for x in (q, v)))
-        layers = [torch.from_numpy(inputs).to(weights[0].dtype)]
-        for weight in weights[:-1]:
-            layers.append(torch.nn.functional.elu(weight @ layers[-1], inplace=True))
-        acceleration = (weights[-1] @ layers[-1]).double().numpy()
+        *layers, last = accelerations(torch.from_numpy(inputs).to(weights[0].dtype), weights)
+        acceleration = last.double().numpy()
         force = np.empty(q.shape)
         nodal_forces(acceleration, kept, points.mass, points.shape, points.hexes, force)
         ctx.points, ctx.kept, ctx.acceleration, ctx.layers = points, kept, acceleration, layers

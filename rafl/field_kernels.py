@@ -31,6 +31,9 @@ BY_STRETCH = 172  # 3
 DETERMINANT = 175
 ROWS = 176
 
+# Where in `kept` each point's quantities stand.
+KEPT_RATE, KEPT_U, KEPT_V, KEPT_TURN, KEPT_STRETCH = 9, 18, 27, 36, 45
+
 _gather = weighted_rows(8, 3, 24)  # sum over nodes of position times gradient
 _row_by_column = lane_products(3, 8, 24)  # (A B)_ij
 _column_by_column = lane_products(3, 24, 24)  # (A^T B)_ij
@@ -126,13 +129,13 @@ def local_features(q, v, hexes, slopes, gravity, kept, inputs):  # type: ignore[
             for r in range(9):
                 for g in range(8):
                     out[r, g] = w[(DEFORMATION + r) * 8 + g]
-                    out[9 + r, g] = w[(RATE + r) * 8 + g]
-                    out[18 + r, g] = w[(U + r) * 8 + g]
-                    out[27 + r, g] = w[(V + r) * 8 + g]
-                    out[36 + r, g] = w[(TURN + r) * 8 + g]
+                    out[KEPT_RATE + r, g] = w[(RATE + r) * 8 + g]
+                    out[KEPT_U + r, g] = w[(U + r) * 8 + g]
+                    out[KEPT_V + r, g] = w[(V + r) * 8 + g]
+                    out[KEPT_TURN + r, g] = w[(TURN + r) * 8 + g]
             for r in range(3):
                 for g in range(8):
-                    out[45 + r, g] = w[(STRETCH + r) * 8 + g]
+                    out[KEPT_STRETCH + r, g] = w[(STRETCH + r) * 8 + g]
 
 
 @njit(**KERNEL)
@@ -189,13 +192,13 @@ def nodal_forces(acceleration, kept, mass, shape, hexes, force):  # type: ignore
     part = np.empty((len(force), cells, 8, 3))
     for c in prange(len(force) * cells):
         b, e = c // cells, c % cells
-        turn = kept[b, e]
+        turn = kept[b, e, KEPT_TURN:]
         own = part[b, e]
         own[:] = 0.0
         for g in range(8):
             a0, a1, a2 = (acceleration[0, c * 8 + g], acceleration[1, c * 8 + g], acceleration[2, c * 8 + g])
             for i in range(3):
-                pull = mass[e, g] * (turn[36 + 3 * i, g] * a0 + turn[37 + 3 * i, g] * a1 + turn[38 + 3 * i, g] * a2)
+                pull = mass[e, g] * (turn[3 * i, g] * a0 + turn[3 * i + 1, g] * a1 + turn[3 * i + 2, g] * a2)
                 for n in range(8):
                     own[n, i] += shape[g, n] * pull
     for b in prange(len(force)):
@@ -212,7 +215,7 @@ def by_acceleration(by_force, kept, mass, shape, hexes, out):  # type: ignore[no
     cells = len(hexes)
     for c in prange(len(by_force) * cells):
         b, e = c // cells, c % cells
-        turn = kept[b, e]
+        turn = kept[b, e, KEPT_TURN:]
         for g in range(8):
             p = c * 8 + g
             for i in range(3):
@@ -221,7 +224,7 @@ def by_acceleration(by_force, kept, mass, shape, hexes, out):  # type: ignore[no
                     total += shape[g, n] * by_force[b, hexes[e, n], i]
                 out[i, p] = mass[e, g] * total
             for i in range(3):
-                out[3 + i, p] = turn[36 + i, g] * out[0, p] + turn[39 + i, g] * out[1, p] + turn[42 + i, g] * out[2, p]
+                out[3 + i, p] = turn[i, g] * out[0, p] + turn[3 + i, g] * out[1, p] + turn[6 + i, g] * out[2, p]
 
 
 @njit(parallel=True, **KERNEL)
@@ -246,12 +249,12 @@ def by_state(by_inputs, by_pull, acceleration, kept, hexes, slopes, gravity, by_
             for r in range(9):
                 for g in range(8):
                     w[(DEFORMATION + r) * 8 + g] = stored[r, g]
-                    w[(RATE + r) * 8 + g] = stored[9 + r, g]
-                    w[(U + r) * 8 + g] = stored[18 + r, g]
-                    w[(V + r) * 8 + g] = stored[27 + r, g]
+                    w[(RATE + r) * 8 + g] = stored[KEPT_RATE + r, g]
+                    w[(U + r) * 8 + g] = stored[KEPT_U + r, g]
+                    w[(V + r) * 8 + g] = stored[KEPT_V + r, g]
             for r in range(3):
                 for g in range(8):
-                    w[(STRETCH + r) * 8 + g] = stored[45 + r, g]
+                    w[(STRETCH + r) * 8 + g] = stored[KEPT_STRETCH + r, g]
             _by_motion(w, by_inputs, by_pull, acceleration, gravity, (b * cells + e) * 8)
             own = part[b, e]
             for n in range(8):

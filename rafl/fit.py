@@ -24,6 +24,7 @@ from rafl.run import (
     load_tensors,
     save_model,
     save_tensors,
+    stale,
     write_history,
 )
 from rafl.warm_start import warm_start
@@ -177,7 +178,7 @@ class _Training:
             first = self.group.agree(1e3 * mean_error(self.validate, model))
             self.history.append({"epoch": 0, "loss": math.nan, "validation_mm": first, "learning_rate": 0.0})
             self._save(best=True)
-        while self.history[-1]["epoch"] < self.settings.epochs and not _stale(self.history, self.settings.patience):
+        while self.history[-1]["epoch"] < self.settings.epochs and not self._stale():
             rate = float(self.schedule.get_last_lr()[0])
             loss = self._epoch()
             self.schedule.step()
@@ -189,21 +190,17 @@ class _Training:
         self.group.wait()
         return load_model(self.run)
 
+    def _stale(self) -> bool:
+        return stale([row["validation_mm"] for row in self.history], self.settings.patience)
+
     def _epoch(self) -> float:
         """Mean loss of one pass over the recordings."""
-        losses = []
+        total = 0.0
         order = torch.randperm(len(self.items), generator=self.shuffle).tolist()
         for first in range(0, len(order), self.settings.batch):
             together = [self.items[k] for k in order[first : first + self.settings.batch]]
-            losses.append(self._update(together))
-        return float(
-            np.average(
-                losses,
-                weights=[
-                    min(self.settings.batch, len(order) - first) for first in range(0, len(order), self.settings.batch)
-                ],
-            )
-        )
+            total += len(together) * self._update(together)
+        return total / len(order)
 
     def _update(self, together: list[Item]) -> float:
         """One step of the optimiser; the batch's mean loss."""
@@ -254,11 +251,6 @@ class _Training:
             save_tensors(self.run / CHECKPOINT, content)
             write_history(self.run, self.history)
         self.report(self.history[-1])
-
-
-def _stale(history: list[dict[str, float]], patience: int) -> bool:
-    errors = [row["validation_mm"] for row in history]
-    return len(errors) - 1 - int(np.argmin(errors)) >= patience
 
 
 def _sample_features(dataset: Dataset) -> torch.Tensor:

@@ -1,5 +1,6 @@
 """`report.html` of an evaluation: one file with its tables and plots inside."""
 
+from itertools import cycle
 from pathlib import Path
 
 import jinja2
@@ -70,7 +71,7 @@ the mean places of all markers in the last tenth of the recording.</p>
 def _error_plot(dataset: str, comparisons: list[Comparison]) -> str:
     figure, axes = plt.subplots(figsize=(9, 3.2), layout="constrained")
     held_out = [item for item in comparisons if item.split == "test"] or comparisons
-    for colour, method in zip(COLOURS, held_out[0].errors, strict=False):
+    for colour, method in zip(cycle(COLOURS), held_out[0].errors, strict=False):
         for number, item in enumerate(held_out):
             label = method if number == 0 else None
             axes.plot(item.error_time, 1e3 * item.errors[method], color=colour, label=label, alpha=0.75)
@@ -84,7 +85,7 @@ def _marker_plot(item: Comparison) -> str:
     marker, axis = liveliest(item.recorded)
     figure, axes = plt.subplots(figsize=(9, 2.8), layout="constrained")
     axes.plot(item.time, 1e3 * item.recorded[:, marker, axis], "k.", markersize=4, label="recorded")
-    for colour, (method, markers) in zip(COLOURS, item.simulated.items(), strict=False):
+    for colour, (method, markers) in zip(cycle(COLOURS), item.simulated.items(), strict=False):
         axes.plot(item.time, 1e3 * markers[:, marker, axis], color=colour, label=method)
     axes.set(xlabel="time [s]", ylabel=f"{'xyz'[axis]} of {item.marker_names[marker]} [mm]")
     axes.set_title(f"{item.dataset} / {item.recording} ({item.split})")

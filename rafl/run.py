@@ -1,8 +1,10 @@
 """A run folder: the fitted model, its settings, its history and where to resume."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 import torch
 import yaml
@@ -159,12 +161,9 @@ def load_model(run: Path) -> FittedModel:
     return FittedModel("rafl", field=field)
 
 
-def read_history(run: Path) -> list[dict[str, float]]:
-    """The rows of `history.csv`; none where there is no such file yet."""
-    path = run / "history.csv"
-    if not path.exists():
-        return []
-    return [{str(key): float(value) for key, value in row.items()} for row in pd.read_csv(path).to_dict("records")]
+def stale(errors: Sequence[float], patience: int) -> bool:
+    """Whether the last `patience` of the validation errors so far, one an epoch, brought nothing better."""
+    return len(errors) - 1 - int(np.argmin(errors)) >= patience
 
 
 def write_history(run: Path, rows: list[dict[str, float]]) -> None:

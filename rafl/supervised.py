@@ -11,7 +11,17 @@ from groundwork import InputError, progress
 from rafl.dataset import Dataset
 from rafl.fit import Report, batches, mean_error, shortened, training_items, validation_batches
 from rafl.global_residual import GlobalResidual
-from rafl.run import FORMAT, FittedModel, Settings, load_model, load_tensors, save_model, save_tensors, write_history
+from rafl.run import (
+    FORMAT,
+    FittedModel,
+    Settings,
+    load_model,
+    load_tensors,
+    save_model,
+    save_tensors,
+    stale,
+    write_history,
+)
 from rafl.targets import residual_targets
 
 STATES = 256  # an update
@@ -46,7 +56,7 @@ def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, repor
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs, eta_min=0.01 * RATE)
     history = [{"epoch": 0, "loss": math.nan, "validation_mm": 1e3 * mean_error(validate, FittedModel("original"))}]
     report(history[-1])
-    best, vain = math.inf, 0
+    best = math.inf
     for epoch in range(1, settings.epochs + 1):
         total = 0.0
         chosen_batches = torch.randperm(len(states)).split(STATES)
@@ -61,13 +71,12 @@ def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, repor
             continue
         error = 1e3 * mean_error(validate, model)
         history.append({"epoch": epoch, "loss": total, "validation_mm": error})
-        vain = 0 if error < best else vain + 1
         if error < best or not (run / "model.pt").exists():
             best = min(best, error)
             save_model(run, model)
         write_history(run, history)
         report(history[-1])
-        if vain == PATIENCE:
+        if stale([row["validation_mm"] for row in history[1:]], PATIENCE):  # row 0 is the untouched simulator
             break
     return load_model(run)
 

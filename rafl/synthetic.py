@@ -15,8 +15,6 @@ from rafl.simulator import Simulator
 
 Array = NDArray[Any]
 
-STANDARD_GRAVITY = 9.80709  # m/s^2, as the paper's simulator has it
-
 
 def vertex_markers(mesh: HexMesh) -> Markers:
     """A marker at every vertex, inner ones too: each rides on the corner of some cell's side."""
@@ -31,10 +29,16 @@ def vertex_markers(mesh: HexMesh) -> Markers:
     return Markers(names, mesh.vertices, quad, weights, np.zeros(len(quad)))
 
 
+def load_force(simulator: Simulator, nodes: NDArray[np.int64], load: float) -> Array:
+    """Nodal forces [N], (N, 3), of a load [kg] that some nodes share."""
+    force = np.zeros_like(simulator.mesh.vertices)
+    force[nodes] = load * np.asarray(simulator.gravity) / len(nodes)
+    return force
+
+
 def hung(target: Simulator, tip: NDArray[np.int64], loads: Array) -> Array:
     """Equilibria [m], (B, N, 3), with loads (B) [kg] shared by the tip's nodes."""
-    force = np.repeat(target.weight[None], len(loads), axis=0)
-    force[:, tip, 2] -= STANDARD_GRAVITY * loads[:, None] / len(tip)
+    force = target.weight + np.stack([load_force(target, tip, load) for load in loads])
     return target.equilibrium(force, what="hanging loads")
 
 
@@ -49,6 +53,18 @@ def twisted(mesh: HexMesh, angles: Array) -> Array:
     result[..., 1] = middle[0] + np.cos(turn) * y - np.sin(turn) * z
     result[..., 2] = middle[1] + np.sin(turn) * y + np.cos(turn) * z
     return result
+
+
+def let_go(simulator: Simulator, starts: Array, frames: int, names: tuple[str, ...]) -> Array:
+    """Positions [m], (T, B, N, 3), of bodies let go from `starts` (B, N, 3), at rest; `names` are for messages.
+
+    Raises:
+        SimulationError: a step failed.
+    """
+    q = torch.from_numpy(starts)
+    none = torch.zeros_like(q)
+    with torch.no_grad():
+        return rollout(simulator, Start(q, none, none, none[..., 0], names), frames - 1)[0].numpy()
 
 
 def released(
@@ -68,11 +84,7 @@ def released(
     Raises:
         SimulationError: a step of the target failed.
     """
-    q = torch.from_numpy(starts)
-    none = torch.zeros_like(q)
-    with torch.no_grad():
-        start = Start(q, none, none, none[..., 0], tuple(splits))
-        positions = rollout(target, start, frames - 1)[0].numpy()
+    positions = let_go(target, starts, frames, tuple(splits))
     shape = (frames, len(base.mesh.vertices))
     empty = np.zeros_like(base.mesh.vertices)
     trajectories = {

@@ -25,6 +25,7 @@ NEARLY_INCOMPRESSIBLE = 0.499  # nu where E alone is sought, as the paper has it
 STARTS = (0.6, 1.7)  # times the assumed E, where the search begins again
 ROUNDS = 2  # iterations before the best of the starts goes on alone
 NORMAL = 1.959964  # 95 % of a normal distribution lie within as many standard deviations
+WALL = 1e6  # the loss where a simulation fails
 STEP = 1e-3  # of a variable, for the curvature's finite differences of the exact gradient
 
 
@@ -133,19 +134,23 @@ class _Search:
         return FittedModel(self.settings.method, material=material)
 
     def __call__(self, x: Array) -> tuple[float, Array]:
-        """Loss and its gradient."""
+        """Loss and its gradient; a high wall where a simulation fails, so that the line search comes back."""
+        try:
+            loss, slope = self._known(x)
+        except SimulationError:
+            if not self.known:
+                raise
+            return WALL, np.zeros(len(x))
+        return loss, np.array(slope)
+
+    def _known(self, x: Array) -> tuple[float, list[float]]:
+        """Loss and its gradient, simulated where they are not known yet."""
         key = tuple(float(value) for value in x)
         if key not in self.known:
-            try:
-                self.known[key] = self._simulate(x)
-            except SimulationError:
-                if not self.known:
-                    raise
-                return 1e6, np.zeros(len(x))  # a trial step too far: the line search comes back
+            self.known[key] = self._simulate(x)
             content = [[list(x), loss, slope] for x, (loss, slope) in self.known.items()]
             save_tensors(self.file, {"format": FORMAT, "method": self.settings.method, "known": content})
-        loss, slope = self.known[key]
-        return loss, np.array(slope)
+        return self.known[key]
 
     def _simulate(self, x: Array) -> tuple[float, list[float]]:
         variables = torch.tensor(x, dtype=torch.float64, requires_grad=True)
@@ -189,6 +194,9 @@ class _Search:
 
         Markers' errors are taken as independent, of the size of what the fit leaves; the curvature of the loss then
         is the information. A number at its bound has no interval.
+
+        Raises:
+            SimulationError: the material beside the best one cannot be simulated.
         """
         inside = [k for k, q in enumerate(self.quantities) if q.bounds[0] + STEP < x[k] < q.bounds[1] - STEP]
         covariance = np.full((len(x), len(x)), np.nan)
@@ -196,7 +204,8 @@ class _Search:
             columns = []
             for k in inside:
                 h = STEP * np.eye(len(x))[k]
-                columns.append((self(x + h)[1] - self(x - h)[1])[inside] / (2.0 * STEP))
+                ahead, behind = (np.array(self._known(place)[1]) for place in (x + h, x - h))
+                columns.append((ahead - behind)[inside] / (2.0 * STEP))
             curvature = 0.5 * (np.array(columns) + np.array(columns).T)
             seen = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.train)
             own = 2.0 * self(x)[0] / max(seen - len(x), 1.0) * np.linalg.pinv(curvature)

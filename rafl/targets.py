@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
-from rafl.dataset import Dataset
 from rafl.errors import SimulationError
 from rafl.objective import Recordings
 from rafl.simulator import Simulator
@@ -64,7 +63,7 @@ def residual_targets(recordings: Recordings, penalty: float, tick: Callable[[], 
     force = np.zeros_like(q)
     parts: list[tuple[Array, Array, Array, Array]] = []
     for step in range(1, len(recordings.markers)):
-        problem = _Step(simulator, dataset, q, v, external, mass, recordings, step, penalty)
+        problem = _Step(recordings, step, q, v, external, mass, penalty)
         after, force, objective = problem.solve(force)
         parts.append((q, v, force, objective))
         q, v = after, (after - q) / simulator.time_step
@@ -74,15 +73,19 @@ def residual_targets(recordings: Recordings, penalty: float, tick: Callable[[], 
 
 @dataclass(frozen=True)
 class _Step:
-    simulator: Simulator
-    dataset: Dataset
+    """The `number`th step of some recordings from states q, v, and how to follow the markers in it."""
+
+    recordings: Recordings
+    number: int
     q: Array
     v: Array
     external: Array
     mass: Array
-    recordings: Recordings
-    number: int
     penalty: float
+
+    @property
+    def simulator(self) -> Simulator:
+        return self.recordings.dataset.simulator
 
     def solve(self, force: Array) -> tuple[Array, Array, Array]:
         """Positions after the step, the force, and the objective (B), starting at the last step's force."""
@@ -122,7 +125,7 @@ class _Step:
 
     def _judge(self, x: Array, force: Array) -> tuple[Array, Array]:
         """Marker gaps (B, 3 M) [m], nought where not seen, and the objective (B)."""
-        markers = self.dataset.markers.positions(torch.from_numpy(x))
+        markers = self.recordings.dataset.markers.positions(torch.from_numpy(x))
         gap = (markers - self.recordings.markers[self.number]) * self.recordings.valid[self.number][..., None]
         flat = gap.flatten(1).numpy()
         return flat, (flat**2).sum(1) + self.penalty * (force**2).sum((1, 2))
@@ -130,8 +133,8 @@ class _Step:
     def _slopes(self, x: Array) -> Array:
         """Derivatives of the markers by the forces on free nodes [m/N], (B, 3 M, n)."""
         engine, batch = self.simulator.engine, len(x)
-        by_corner = self.dataset.markers.slopes(torch.from_numpy(x)).numpy()  # (B, M, 3, 4, 3)
-        quad = self.dataset.markers.quad
+        by_corner = self.recordings.dataset.markers.slopes(torch.from_numpy(x)).numpy()  # (B, M, 3, 4, 3)
+        quad = self.recordings.dataset.markers.quad
         count = len(quad)
         right = np.zeros((batch, count, 3, x.shape[1], 3))
         for corner in range(4):

@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rafl.dataset import Dataset
-from rafl.field_force import FieldPoints
+from rafl.field_force import FieldPoints, accelerations
+from rafl.field_kernels import KEPT_TURN
 from rafl.residual import ResidualField
+from rafl.run import stale
 
 Array = NDArray[Any]
 
@@ -85,7 +87,7 @@ class _Lesson:
         self.states = states
         self.size = np.sqrt((inputs**2).mean(axis=1))
         self.inputs = torch.from_numpy(inputs.astype(np.float32)).reshape(len(inputs), states, each)
-        turn = kept[:, :, 36:45].transpose(0, 1, 3, 2).reshape(states, each, 3, 3)
+        turn = kept[:, :, KEPT_TURN : KEPT_TURN + 9].transpose(0, 1, 3, 2).reshape(states, each, 3, 3)
         self.turn = torch.from_numpy(turn.astype(np.float32))
         shares = np.zeros((each, nodes))
         for cell, corners in enumerate(points.hexes):
@@ -103,11 +105,8 @@ class _Lesson:
 
     def loss(self, field: ResidualField, chosen: Tensor) -> Tensor:
         """Work of the force still missing in some states, as a share of all that was missing at first."""
-        *hidden, last = field.weights(torch.float32)
-        layer = self.inputs[:, chosen].flatten(1)
-        for weight in hidden:
-            layer = torch.nn.functional.elu(weight @ layer)
-        acceleration = (last @ layer).reshape(3, len(chosen), -1).permute(1, 2, 0)
+        points = accelerations(self.inputs[:, chosen].flatten(1), field.weights(torch.float32))[-1]
+        acceleration = points.reshape(3, len(chosen), -1).permute(1, 2, 0)
         pull = (self.turn[chosen] @ acceleration[..., None])[..., 0]
         force = torch.einsum("pn,bpi->bni", self.shares, pull).flatten(1)
         return self._work(force - self.force[chosen]) / self.work
@@ -146,8 +145,7 @@ def warm_start(
     order = torch.Generator().manual_seed(seed)
     batches = sum(lesson.states // BATCH for lesson in lessons)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(epochs * batches, 1), eta_min=0.01 * RATE)
-    best, kept = judge(), {key: value.clone() for key, value in field.state_dict().items()}
-    vain = 0
+    errors, kept = [judge()], {key: value.clone() for key, value in field.state_dict().items()}
     for epoch in range(epochs):
         total = 0.0
         turns = [
@@ -163,11 +161,10 @@ def warm_start(
             optimiser.step()
             schedule.step()
             total += loss.item()
-        error = judge()
-        report({"warm_start": epoch + 1, "missing": float(np.sqrt(total / len(turns))), "validation_mm": error})
-        vain = 0 if error < best else vain + 1
-        if vain == PATIENCE:
+        errors.append(judge())
+        report({"warm_start": epoch + 1, "missing": float(np.sqrt(total / len(turns))), "validation_mm": errors[-1]})
+        if errors[-1] < min(errors[:-1]):
+            kept = {key: value.clone() for key, value in field.state_dict().items()}
+        if stale(errors, PATIENCE):
             break
-        if error < best:
-            best, kept = error, {key: value.clone() for key, value in field.state_dict().items()}
     field.load_state_dict(kept)

@@ -1,5 +1,6 @@
 """What a stranger gets wrong: every command answers in one line, with exit code 2, and writes nothing."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,10 @@ from capture.build import CaptureSettings, RecordingRow, build_dataset
 from capture.motion import tip_load_release
 from capture.specimen import Specimen
 from rafl.dataset import Dataset, write_dataset
+from rafl.global_residual import GlobalResidual
 from rafl.mesh import HexMesh
+from rafl.run import FittedModel, save_model
+from rafl.synthetic import released
 
 COMMANDS = ("rafl-render", "rafl-calibrate", "rafl-track", "rafl-capture", "rafl-fit", "rafl-eval")
 
@@ -218,6 +222,27 @@ def test_fit_and_eval_refuse(built: Dataset, run: Run, tmp_path: Path) -> None:
     assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--epochs", "2", "--resume"), "the settings")
     (tmp_path / "run" / "model.pt").write_bytes(b"x")
     assert_refused(run("rafl-eval", "run", "a.h5"), "model.pt", "cannot be read")
+
+
+def test_a_model_of_another_mesh_is_left_out_and_a_model_of_none_refused(
+    built: Dataset, run: Run, tmp_path: Path
+) -> None:
+    """Whatever its place on the command line, and it counts only where it acts."""
+    write_dataset(tmp_path / "small.h5", built)
+    save_model(tmp_path / "srl", FittedModel("srl", network=GlobalResidual(7)))
+    save_model(tmp_path / "sysid", FittedModel("sysid", material={"youngs_modulus": 190e3, "poissons_ratio": 0.45}))
+    assert_refused(run("rafl-eval", "srl", "small.h5"), "srl: expected the mesh")
+    assert_refused(run("rafl-eval", "srl", "sysid", "small.h5"), "srl: expected the mesh")
+    said = run("rafl-eval", "sysid", "small.h5")
+    assert said.returncode == 0, said.stderr
+    assert "sysid: worse than the original simulator on 1 of 1 datasets" in said.stdout
+    other = replace(built.simulator, mesh=HexMesh.box((2, 1, 1), (0.02, 0.01, 0.01)), fixed=np.arange(4))
+    write_dataset(tmp_path / "other.h5", released("other", other, other, other.mesh.vertices[None], 3, {"a": "test"}))
+    save_model(tmp_path / "srl", FittedModel("srl", network=GlobalResidual(12)))
+    said = run("rafl-eval", "srl", "sysid", "small.h5", "other.h5", "--out", "both")
+    assert said.returncode == 0, said.stderr
+    assert re.search(r"srl: worse than the original simulator on \d of 1 datasets", said.stdout)
+    assert re.search(r"held-out marker error: original [\d.]+ mm, sysid [\d.]+ mm", said.stdout)
     assert not (tmp_path / "run" / "errors.csv").exists()
 
 

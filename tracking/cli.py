@@ -166,8 +166,8 @@ def _check(calib: Path, views: dict[str, list[View]], sizes: dict[str, tuple[int
         if not own:
             raise InputError(f"camera {name}: expected pictures that show the board, found none; check board.yaml")
         with progress() as bar:
-            views_ = bar.track(own, description=f"{name}: placing the board")
-            checked[name] = [check_view(camera, view) for view in views_]
+            placed = bar.track(own, description=f"{name}: placing the board")
+            checked[name] = [check_view(camera, view) for view in placed]
         path = Path(f"check-{name}.png")
         write_picture(path, camera.image_size, checked[name], name)
         typer.echo(f"wrote {path}")

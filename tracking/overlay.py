@@ -56,7 +56,7 @@ def write_overlay(
     shrink = min(1.0, WIDEST / max(video.size))
     width, height = (max(int(side * shrink) // 2 * 2, 2) for side in video.size)
     pixel = shown_pixels(tracks, name, camera) * shrink
-    row_of = {number: row for row, number in reversed(list(enumerate(tracks.frame[name].tolist())))}
+    row_of = tracks.rows(name)
     with whole_file(path) as temporary, av.open(str(temporary), "w", format="mp4") as output:
         stream = output.add_stream("libx264", rate=Fraction(min(tracks.fps, 25.0)).limit_denominator(100))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"

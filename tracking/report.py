@@ -88,7 +88,7 @@ def _camera(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
     pictures = tracks.pictures[name]
     first = min(pictures)
     sigma = tracks.pixel_sigma[name]
-    row_of = {number: row for row, number in reversed(list(enumerate(tracks.frame[name].tolist())))}
+    row_of = tracks.rows(name)
     worst = []
     for number in sorted(set(pictures) & set(row_of) - {first}):
         row = row_of[number]

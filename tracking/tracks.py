@@ -58,6 +58,10 @@ class Tracks:
     notes: tuple[str, ...] = ()
     version: str = VERSION
 
+    def rows(self, camera: str) -> dict[int, int]:
+        """The first row that shows each frame of a camera's video, by the frame's number."""
+        return {number: row for row, number in reversed(list(enumerate(self.frame[camera].tolist())))}
+
 
 def write_tracks(path: Path, tracks: Tracks) -> None:
     """Write a tracks file, whole or not at all."""

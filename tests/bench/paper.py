@@ -22,7 +22,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from groundwork import whole_file, write_text
+from groundwork import write_text
 from rafl.dataset import Dataset, read_dataset, write_dataset
 from rafl.evaluation import compare, split_table
 from rafl.fit import Item, batches, mean_error
@@ -217,8 +217,7 @@ def time_to_accuracy(study: Study) -> None:
 
 def write_table(path: Path, table: pd.DataFrame, notes: list[str]) -> None:
     header = "".join(f"# {note}\n" for note in notes)
-    with whole_file(path) as temporary:
-        temporary.write_text(header + table.to_csv(index=False, float_format="%.4f"))
+    write_text(path, header + table.to_csv(index=False, float_format="%.4f"))
 
 
 def show(title: str, table: pd.DataFrame) -> None:

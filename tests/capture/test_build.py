@@ -8,10 +8,11 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from capture.build import CaptureSettings, RecordingRow, build_dataset, read_recording_rows
-from capture.motion import tip_force, tip_load_release
+from capture.motion import tip_load_release
 from capture.specimen import Specimen
 from groundwork import InputError
 from rafl.dataset import Dataset
+from rafl.synthetic import load_force
 from tracking.layout import MarkerLayout
 from tracking.tracks import Tracks, write_tracks
 
@@ -53,15 +54,15 @@ def test_the_authors_arrays_are_registered_by_their_rest_row(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
     np.save(tmp_path / "q0.npy", 1e3 * in_the_lab(truth))
-    item = build(small_specimen, tmp_path).trajectories["q0"]
+    built = build(small_specimen, tmp_path)
+    item = built.trajectories["q0"]
     np.testing.assert_allclose(item.markers, truth[1:], atol=1e-9)
     np.testing.assert_allclose(item.time, 0.01 * np.arange(FRAMES))
     assert item.attributes["registration_residual_mm"] < 1e-6
     assert item.attributes["fit_residual_mm"] < 0.1
     # The virtual force is the load: 60 g.
-    np.testing.assert_allclose(
-        item.virtual_force.sum(0), tip_force(small_specimen, 0.06).sum(0), atol=0.03
-    )  # fmt: skip
+    load = load_force(built.simulator, small_specimen.loaded, 0.06)
+    np.testing.assert_allclose(item.virtual_force.sum(0), load.sum(0), atol=0.03)
 
 
 def with_clamp(specimen: Specimen) -> Specimen:

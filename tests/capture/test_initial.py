@@ -3,8 +3,8 @@ import pytest
 import torch
 
 from capture.initial import fit_first_frame
-from capture.motion import tip_force
 from capture.specimen import Specimen
+from rafl.synthetic import hung
 
 
 @pytest.mark.parametrize("force", [(0.0, 0.0, -0.4), (0.05, 0.1, 0.3)])
@@ -29,7 +29,7 @@ def test_unseen_markers_and_unobserved_axes_do_not_count(small_specimen: Specime
     """Depth 2 mm wrong with a sigma of 5 mm, and three markers missing: the shape is still found."""
     simulator = small_specimen.simulator(0.01)
     markers = small_specimen.markers(1e-6)
-    truth = simulator.equilibrium((simulator.weight + tip_force(small_specimen, 0.05))[None])[0]
+    truth = hung(simulator, small_specimen.loaded, np.array([0.05]))[0]
     target = markers.positions(torch.from_numpy(truth)).numpy()
     target[:, 1] += 2e-3
     sigma = np.full_like(target, 1e-5)

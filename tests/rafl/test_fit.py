@@ -102,20 +102,20 @@ def test_the_stated_uncertainty_is_the_actual_one(dataset: Dataset, tmp_path: Pa
     """Over noisy copies of the recordings E scatters as its interval says; E and nu trade off, and it is said."""
     random = np.random.default_rng(3)
     found, widths = [], []
-    for k in range(5):
+    for k in range(16):
         noisy = {
             name: replace(item, markers=item.markers + random.normal(0, 2e-4, item.markers.shape))
             for name, item in dataset.trajectories.items()
         }
         run = tmp_path / str(k)
-        settings = replace(SETTINGS, method="sysid-e", epochs=6, frames=8)
+        settings = replace(SETTINGS, method="sysid-e", epochs=4, frames=6)
         model = identify_material([replace(dataset, trajectories=noisy)], settings, run, silent)
         assert model.material is not None
         assert model.material["poissons_ratio"] == 0.499
         table = pd.read_csv(run / "parameters.csv")
         found.append(model.material["youngs_modulus"])
         widths.append((table["high_95"][0] - table["low_95"][0]) / 2 / 1.96)
-    assert np.std(found, ddof=1) == pytest.approx(np.mean(widths), rel=0.8)
+    assert np.std(found, ddof=1) == pytest.approx(np.mean(widths), rel=0.5)  # of 16 copies, it varies by 18 %
 
 
 def test_trading_off_is_said() -> None:
