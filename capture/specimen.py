@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field
 
+from capture.geometry import Geometry
 from groundwork import InputError, StrictModel, read_yaml
 from rafl.markers import Markers, embed, embedding_gap
 from rafl.material import PRESETS, Material
@@ -16,19 +17,6 @@ from tracking.layout import SPECIMEN_FORMAT, MarkerLayout, MarkerList
 
 DEFAULT_PRESET: Literal["paper", "physical"] = "physical"
 Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
-
-
-class _Geometry(StrictModel):
-    box_mm: tuple[float, float, float]
-    element_mm: float = Field(gt=0)
-
-    @model_validator(mode="after")
-    def _whole_cells(self) -> "_Geometry":
-        for size in self.box_mm:
-            cells = size / self.element_mm
-            if size <= 0 or abs(cells - round(cells)) > 1e-6:
-                raise ValueError(f"expected sides that are whole multiples of {self.element_mm} mm")
-        return self
 
 
 class _Material(StrictModel):
@@ -65,7 +53,7 @@ class _Load(StrictModel):
 class _SpecimenFile(StrictModel):
     format: str
     name: str = Field(pattern=r"^[\w.-]+$")
-    geometry: _Geometry
+    geometry: Geometry
     material: _Material
     clamp: _Clamp
     load: _Load = _Load(face="x-max")
@@ -87,6 +75,7 @@ class Specimen:
         clamp_layout: of the markers on the clamp; may be empty.
         text: of the file.
         integrator, substeps: how its simulator steps in time.
+        volume: of the shape that the mesh stands for [m^3].
     """
 
     name: str
@@ -99,6 +88,7 @@ class Specimen:
     text: str
     integrator: str
     substeps: int
+    volume: float
 
     def simulator(self, time_step: float, material: Material | None = None) -> Simulator:
         """A simulator of this specimen, of its assumed material unless another is given."""
@@ -134,12 +124,11 @@ def read_specimen(path: Path) -> Specimen:
     """Read `specimen.yaml`.
 
     Raises:
-        InputError: missing, damaged, or of a newer version.
+        InputError: missing, damaged, of a newer version, or a shape that cannot be meshed.
     """
     content = read_yaml(path, _SpecimenFile, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
-    size = 1e-3 * np.array(content.geometry.box_mm)
-    cells = np.round(np.array(content.geometry.box_mm) / content.geometry.element_mm).astype(int)
-    mesh = HexMesh.box(cells, size)
+    solid = content.geometry.solid(path.parent, content.clamp.face)
+    mesh = solid.mesh
     return Specimen(
         content.name,
         mesh,
@@ -151,4 +140,5 @@ def read_specimen(path: Path) -> Specimen:
         path.read_text(encoding="utf-8"),
         content.simulation.integrator,
         content.simulation.substeps,
+        solid.volume,
     )

@@ -22,6 +22,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from capture.specimen import read_specimen
 from groundwork import write_text
 from rafl.dataset import Dataset, read_dataset, write_dataset
 from rafl.evaluation import compare, split_table
@@ -35,6 +36,7 @@ from rafl.simulator import Simulator
 from rafl.synthetic import hung, released, twisted, with_material
 
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
+SPECIMENS = EXPERIMENTS.parent / "specimens"
 SEED = 0
 LARGE = 1000  # vertices: such a shape is fine-tuned for fewer epochs, and left out by --quick
 BEAMS = ("canonical", "longer", "shorter", "thicker", "thinner")
@@ -55,30 +57,13 @@ class Effort:
 FULL, QUICK = Effort(60, 1000, 40, 30, 4), Effort(20, 150, 8, 5, None)
 
 
-def mesh_of(shape: dict[str, Any]) -> HexMesh:
-    if "box_mm" in shape:
-        return HexMesh.box(shape["cells"], 1e-3 * np.array(shape["box_mm"]))
-    sections = shape.get("rectangles") or shape["ellipses"]
-    if "rectangles" in shape:
-        wide, high = max(w for w, _ in sections), max(h for _, h in sections)
-        cells = np.zeros((len(sections), wide, high), dtype=bool)
-        for x, (w, h) in enumerate(sections):
-            cells[x, (wide - w) // 2 : (wide + w) // 2, (high - h) // 2 : (high + h) // 2] = True
-    else:
-        wide, high = (int(max(axis[k] for axis in sections)) for k in (0, 1))
-        y, z = np.arange(-wide, wide + 1)[:, None], np.arange(-high, high + 1)
-        cells = np.array([(y / a) ** 2 + (z / b) ** 2 <= 1.0 for a, b in sections])
-    return HexMesh.from_grid(cells, 1e-3 * shape["element_mm"])
-
-
 class Study:
     """One experiment under one folder."""
 
     def __init__(self, name: str, out: Path, effort: Effort, tail: Path | None) -> None:
         self.name, self.out, self.effort = name, out / name, effort
         self.plan = yaml.safe_load((EXPERIMENTS / f"{name}.yaml").read_text())
-        shapes = yaml.safe_load((EXPERIMENTS / "shapes.yaml").read_text())["shapes"]
-        self.meshes = {shape: mesh_of(content) for shape, content in shapes.items()}
+        self.meshes = {shape: read_specimen(SPECIMENS / f"{shape}.yaml").mesh for shape in self.plan["paper"]}
         if tail is not None:
             self.meshes["fishtail-fine"] = HexMesh.from_grid(np.load(tail), 0.003)
         if effort.fine_large is None:
