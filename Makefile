@@ -7,7 +7,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 # BLAS threads fight the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking bench-paper clean
+.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking bench-paper bench-capture clean
 
 install: $(VENV)/installed
 
@@ -61,6 +61,10 @@ bench-tracking: install
 # The paper's sim-to-sim studies, hours: make bench-paper; QUICK=1 for a short form. Resumable.
 bench-paper: install
 	$(BIN)/python tests/bench/paper.py $(if $(QUICK),--quick,--results datasets/results) $(if $(wildcard $(TAIL)),--tail-cells $(TAIL))
+
+# The first frame: the direct fit beside the sequence of forces of earlier work.
+bench-capture: install
+	$(BIN)/python tests/bench/first_frame.py
 
 clean:
 	rm -rf build $(VENV)

@@ -1,22 +1,27 @@
 """The commands `rafl-render` and `rafl-capture`."""
 
+import re
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import torch
 import typer
 from rich.console import Console
-from rich.table import Table
 
-from capture.build import CaptureSettings, build_dataset, read_recording_rows
+from capture.build import CaptureSettings, build_dataset
 from capture.film import ENCODINGS, film, side_cameras, write_board_images, write_truth
 from capture.motion import Motion, tip_load_release, twist_release
+from capture.page import print_page, recordings_table, warnings
+from capture.registration import RestPose
 from capture.render import Look, Painter
+from capture.report import write_dataset_report
 from capture.specimen import read_specimen
+from capture.table import read_recording_rows
 from groundwork import InputError, command_line, progress, user_command, write_text
-from rafl.dataset import write_dataset
+from rafl.dataset_file import damaged_parts, update_dataset, write_dataset
 from rafl.errors import SimulationError
 
 render_app = command_line("Film simulated specimens.")
@@ -121,28 +126,68 @@ def _splits(motions: list[Motion]) -> str:
     return "\n".join(["recording,load_g,split", *rows, ""])
 
 
+class Initial(StrEnum):
+    """How the first frame is understood, and found."""
+
+    rest = "rest"
+    moving = "moving"
+    sequence = "sequence"
+
+
+class Forces(StrEnum):
+    """Where virtual forces act."""
+
+    tip = "tip"
+    surface = "surface"
+
+
 @capture_app.command()
 @user_command
 def capture(
-    specimen: Annotated[Path, typer.Argument(help="Specimen description (specimen.yaml).")],
+    specimen: Annotated[Path | None, typer.Argument(help="Specimen description (specimen.yaml).")] = None,
     tracks: Annotated[
-        Path, typer.Argument(help="Folder of tracks (.h5), motion capture (.c3d) or q0.npy, q1.npy, ...")
-    ],
-    recordings: Annotated[Path, typer.Option(help="Table of recordings: recording,load_g,split.")],
+        Path | None, typer.Argument(help="Folder of tracks (.h5), motion capture (.c3d) or q0.npy, q1.npy, ...")
+    ] = None,
+    recordings: Annotated[Path | None, typer.Option(help="Table of recordings: recording,load_g,split.")] = None,
     out: Annotated[Path | None, typer.Option(help="Dataset to write [datasets/SPECIMEN.h5].")] = None,
+    update: Annotated[bool, typer.Option("--update", help="Add to, or replace in, the dataset there.")] = False,
     tolerance_mm: Annotated[float, typer.Option(min=0.0, help="Markers may stand this far off the skin.")] = 2.0,
     fit_tolerance_mm: Annotated[float, typer.Option(min=0.0, help="Registration may be this far off.")] = 3.0,
-    rest: Annotated[str | None, typer.Option(help="RECORDING:FRAME in which the specimen is undeformed.")] = None,
+    rest: Annotated[
+        str | None, typer.Option(help="Where the specimen is undeformed: RECORDING, or RECORDING:FIRST-LAST frames.")
+    ] = None,
     moving_clamp: Annotated[bool, typer.Option(help="Follow the clamp's markers, where there are some.")] = True,
+    start: Annotated[
+        int | None, typer.Option(min=0, help="First frame of the motion [by recording, from the motion].")
+    ] = None,
+    initial: Annotated[
+        Initial,
+        typer.Option(help="First frame at rest; moving; or at rest, found the slow way of earlier work (sequence)."),
+    ] = Initial.rest,
+    forces: Annotated[Forces, typer.Option(help="Where virtual forces hold the first frame.")] = Forces.tip,
     fps: Annotated[float, typer.Option(min=0.1, help="Frames per second of npy files.")] = 100.0,
+    inspect: Annotated[Path | None, typer.Option(help="Only print what a dataset holds.")] = None,
+    verify: Annotated[Path | None, typer.Option(help="Only compare a dataset with its hashes.")] = None,
 ) -> None:
     """Register recordings to the specimen, tie the markers to its mesh, and fit each first frame.
 
     Example: rafl-capture specimen.yaml tracks/ --recordings recordings.csv
     """
+    torch.set_num_threads(1)  # the element kernels have the other cores
+    if inspect is not None or verify is not None:
+        _look(inspect, verify)
+        return
+    if specimen is None or tracks is None or recordings is None:
+        raise InputError(
+            "expected a specimen, a folder of tracks and --recordings, found fewer; for instance "
+            "rafl-capture specimen.yaml tracks/ --recordings recordings.csv"
+        )
     described = read_specimen(specimen)
-    rows = read_recording_rows(recordings)
-    settings = CaptureSettings(1e-3 * tolerance_mm, 1e-3 * fit_tolerance_mm, fps, _rest_frame(rest), moving_clamp)
+    rows = read_recording_rows(recordings, complete=not update)
+    settings = CaptureSettings(
+        1e-3 * tolerance_mm, 1e-3 * fit_tolerance_mm, fps, _rest_pose(rest), moving_clamp, start,
+        initial.value, forces.value,
+    )  # fmt: skip
     path = out or Path("datasets") / f"{described.name}.h5"
     recipe = f"{described.text}\n# recordings.csv\n{recordings.read_text(encoding='utf-8')}"
     with progress() as bar:
@@ -151,24 +196,37 @@ def capture(
             dataset = build_dataset(described, tracks, rows, settings, recipe, lambda: bar.advance(task))
         except SimulationError as error:
             raise InputError(f"{error}; is the first frame a picture of the specimen at rest?") from None
-    write_dataset(path, dataset)
-    table = Table("recording", "split", "load [g]", "frames", "seen", "registration [mm]", "first frame [mm]")
-    for name, item in dataset.trajectories.items():
-        values = item.attributes
-        table.add_row(
-            name, item.split, f"{values['load_g']:g} {values['load']}", str(len(item.time)),
-            f"{item.valid.mean():.1%}", f"{values['registration_residual_mm']:.3f}",
-            f"{values['fit_residual_mm']:.3f}",
-        )  # fmt: skip
-    Console(width=110).print(table)
-    typer.echo(f"wrote {path}")
+    (update_dataset if update else write_dataset)(path, dataset)
+    report = path.with_suffix(".html")
+    write_dataset_report(report, described, dataset)
+    Console(width=130).print(recordings_table(dataset))
+    for line in warnings(dataset):
+        typer.echo(line, err=True)
+    typer.echo(f"wrote {path} and {report}")
     typer.echo(f"next: rafl-fit {path}")
 
 
-def _rest_frame(text: str | None) -> tuple[str, int] | None:
+def _look(inspect: Path | None, verify: Path | None) -> None:
+    if inspect is not None:
+        print_page(inspect, Console(width=130, soft_wrap=True))
+    if verify is not None:
+        damaged = damaged_parts(verify)
+        if damaged:
+            raise InputError(
+                f"expected {verify} as it was written, found {', '.join(damaged)} changed; build it again, or fetch "
+                "another copy"
+            )
+        typer.echo(f"{verify}: all parts are as they were written")
+
+
+def _rest_pose(text: str | None) -> RestPose | None:
     if text is None:
         return None
-    recording, _, frame = text.rpartition(":")
-    if not recording or not frame.isdigit():
-        raise InputError(f"--rest: expected RECORDING:FRAME, found {text!r}; for instance straight:12")
-    return recording, int(frame)
+    found = re.fullmatch(r"(?P<recording>[^:]+)(:(?P<first>\d+)(-(?P<last>\d+))?)?", text)
+    if found is None:
+        raise InputError(
+            f"--rest: expected RECORDING, RECORDING:FRAME or RECORDING:FIRST-LAST, found {text!r}; for instance "
+            "straight:12-40"
+        )
+    first, last = (None if found[key] is None else int(found[key]) for key in ("first", "last"))
+    return RestPose(found["recording"], first, first if last is None else last)

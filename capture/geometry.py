@@ -151,7 +151,7 @@ def read_surface(path: Path) -> trimesh.Trimesh:
         raise InputError(f"expected a surface ({', '.join(SURFACES)}), found {path}; export it in one of these")
     try:
         surface = trimesh.load_mesh(path, skip_materials=True)
-    except (ValueError, IndexError, KeyError, TypeError, UnicodeDecodeError, AttributeError) as error:
+    except (ValueError, IndexError, KeyError, TypeError, AttributeError, ImportError) as error:
         reason = " ".join(str(error).split())
         raise InputError(
             f"expected a surface in {path}, which cannot be read: {reason:.120}; export it again"

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from capture.rigid import IDENTITY, Rigid
 from rafl.errors import SimulationError
 from rafl.markers import Markers
 from rafl.simulator import Simulator
@@ -14,11 +15,48 @@ from rafl.simulator import Simulator
 Array = NDArray[Any]
 
 # Prior standard deviations of a nodal force [N]: of the part that varies linearly over the loaded
-# nodes (a pull and a moment), and of the rest, which would dent the mesh to please single markers.
-LINEAR_SIGMA, LOCAL_SIGMA = 1.0, 0.05
-LEAST_SIGMA = 5e-5  # markers are not pulled closer than this: the mesh is not the specimen [m]
-FIRST_DAMPING, LAST_DAMPING = 1e2, 1e8  # of a step, as a multiple of the prior
-CONVERGED = 1e-6  # relative fall of the objective
+# nodes (a pull and a moment), and of the rest, which would dent the mesh to please single markers:
+# first none of it, then little, then more where that halves what is left.
+LINEAR_SIGMA, LOCAL_SIGMAS = 1.0, (1e-5, 5e-3, 5e-2)
+SURFACE_SIGMA = 0.1  # of every force, where forces act all over the surface
+FIRST_DAMPING, LAST_DAMPING = 1e4, 1e16  # of a step, as a multiple of the prior
+QUICK = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
+CONVERGED, ENOUGH = 1e-4, 1e-3  # the search ends where a whole step promises less, of the objective and at all
+UNOBSERVED = 10.0  # times the median sigma: an axis that no camera saw
+
+
+@dataclass(frozen=True)
+class FirstFrame:
+    """What was seen of the first frame.
+
+    Attributes:
+        simulator: of the specimen.
+        markers: tied to its mesh.
+        nodes: that virtual forces act on, (L).
+        target: markers [m], (M, 3), NaN where not seen.
+        sigma: their standard deviation [m], (M, 3).
+        what: recording, for messages.
+        everywhere: whether the nodes are the whole surface, on each of which a force of its own may act.
+    """
+
+    simulator: Simulator
+    markers: Markers
+    nodes: NDArray[np.int64]
+    target: Array
+    sigma: Array
+    what: str
+    everywhere: bool = False
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which markers were, (M)."""
+        return np.isfinite(self.target[:, 0])
+
+    @property
+    def observed(self) -> NDArray[np.bool_]:
+        """Which coordinates of the seen markers some camera saw, (M', 3)."""
+        sigma = self.sigma[self.seen]
+        return sigma < UNOBSERVED * np.median(sigma)
 
 
 @dataclass(frozen=True)
@@ -29,92 +67,159 @@ class InitialState:
         q: [m], (N, 3).
         force: virtual nodal forces, gravity excepted [N], (N, 3).
         residual: root mean square marker distance over the observed axes [m].
+        pose: from the recorded frame to the specimen frame.
     """
 
     q: Array
     force: Array
     residual: float
+    pose: Rigid
 
 
-def fit_first_frame(
-    simulator: Simulator, markers: Markers, nodes: NDArray[np.int64], target: Array, sigma: Array, what: str
-) -> InitialState:
+def fit_first_frame(frame: FirstFrame, pose: Rigid | None = None) -> InitialState:
     """Virtual forces on some nodes such that the equilibrium's markers match the first frame.
 
     Levenberg-Marquardt on sum |x(q(f)) - target|^2 / sigma^2 + f . C^-1 f with C the prior of the forces;
     the Jacobian through the equilibrium is the implicit-function theorem's, dx/df = dx/dq K^-1.
 
+    A mesh is not the specimen. At the free end first only forces that vary linearly over the nodes are sought; what
+    they leave beyond sigma is added to sigma, lest the mesh be dented to please markers that it cannot meet.
+
     Args:
-        simulator: of the specimen.
-        markers: tied to its mesh.
-        nodes: that forces act on, (L).
-        target: markers of the first frame [m], (M, 3), NaN where not seen.
-        sigma: their standard deviation [m], (M, 3).
-        what: recording, for messages.
+        frame: what was seen.
+        pose: where the specimen frame is sought too, a first guess of it.
 
     Raises:
         SimulationError: an equilibrium could not be found.
     """
-    seen = np.isfinite(target[:, 0])
-    wanted = target[seen].ravel()
-    weight = 1.0 / np.maximum(sigma[seen], LEAST_SIGMA).ravel()
-    force = np.zeros_like(simulator.mesh.vertices)
-    precision = _force_precision(simulator.mesh.vertices[nodes])
-    where = f"{what}: first frame"
+    posed, force = pose is not None, np.zeros_like(frame.simulator.mesh.vertices)
+    if frame.everywhere:
+        last = _Search(frame, posed, SURFACE_SIGMA, 0.0).descend(force, pose or IDENTITY, None)
+    else:
+        none, little, more = LOCAL_SIGMAS
+        first = _Search(frame, posed, none, 0.0).descend(force, pose or IDENTITY, None)
+        own = frame.sigma[frame.seen][frame.observed]
+        beyond = np.sqrt(max(_size(frame, first.gap) ** 2 - float((own**2).mean()), 0.0))
+        last = _Search(frame, posed, little, beyond).descend(first.force, first.pose, first.q)
+        trial = _Search(frame, posed, more, beyond).descend(last.force, last.pose, last.q)
+        last = trial if _size(frame, trial.gap) < 0.5 * _size(frame, last.gap) else last
+    return InitialState(last.q, last.force, np.sqrt(3.0) * _size(frame, last.gap), last.pose)
 
-    def equilibrium(at: Array, start: Array | None) -> Array:
+
+def _size(frame: FirstFrame, gap: Array) -> float:
+    """Root mean square of the gaps (3 M') along observed axes [m]."""
+    return float(np.sqrt((gap.reshape(-1, 3)[frame.observed] ** 2).mean()))
+
+
+@dataclass(frozen=True)
+class _State:
+    force: Array
+    pose: Rigid
+    q: Array
+    gap: Array  # (3 M'): of the mesh's markers from the seen ones [m]
+    objective: float
+
+
+class _Search:
+    """One descent: with or without the pose, one prior, one size of what the mesh cannot meet."""
+
+    def __init__(self, frame: FirstFrame, posed: bool, local: float, beyond: float) -> None:
+        self.frame, self.posed = frame, posed
+        self.precision = force_precision(frame.simulator.mesh.vertices[frame.nodes], local)
+        self.weight = 1.0 / np.sqrt(frame.sigma[frame.seen].ravel() ** 2 + beyond**2)
+
+    def state(self, force: Array, pose: Rigid, start: Array | None) -> _State:
+        frame = self.frame
+        total = (frame.simulator.weight + force)[None]
         begin = None if start is None else start[None]
-        return simulator.equilibrium((simulator.weight + at)[None], begin, where)[0]
+        q = frame.simulator.equilibrium(total, begin, f"{frame.what}: first frame")[0]
+        own = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.seen]
+        gap = (own - pose.apply(frame.target[frame.seen])).ravel()
+        at = force[frame.nodes]
+        return _State(force, pose, q, gap, float(((self.weight * gap) ** 2).sum() + (at * (self.precision @ at)).sum()))
 
-    def gap_of(q: Array) -> Array:
-        return markers.positions(torch.from_numpy(q)).numpy()[seen].ravel() - wanted
+    def descend(self, force: Array, pose: Rigid, start: Array | None) -> _State:
+        """From some forces and pose to the best."""
+        frame, nodes = self.frame, self.frame.nodes
+        now = self.state(force, pose, start)
+        prior = np.kron(self.precision, np.eye(3))
+        free = np.zeros((6, 6)) if self.posed else np.zeros((0, 0))
+        penalty = np.block([[prior, np.zeros((len(prior), len(free)))], [np.zeros((len(free), len(prior))), free]])
+        damping, growth = FIRST_DAMPING, 2.0  # after H. B. Nielsen
+        while True:
+            slopes = marker_slopes(frame, now.q)
+            if self.posed:
+                slopes = np.concatenate([slopes, -_pose_slopes(now.pose.apply(frame.target[frame.seen]))], axis=1)
+            slopes *= self.weight[:, None]
+            right = slopes.T @ (self.weight * now.gap)
+            right[: len(prior)] += prior @ now.force[nodes].ravel()
+            normal = slopes.T @ slopes + penalty
+            if right @ np.linalg.solve(normal, right) < CONVERGED * now.objective + ENOUGH:
+                return now
+            fall = -np.inf
+            while fall <= 0.0 and damping <= LAST_DAMPING:
+                held = penalty + np.diag(np.r_[np.zeros(len(prior)), 1e-6 * np.diag(normal)[len(prior) :]])
+                step = np.linalg.solve(normal + damping * held, -right)
+                trial = now.force.copy()
+                trial[nodes] += step[: len(prior)].reshape(-1, 3)
+                moved = now.pose.moved(step[len(prior) :]) if self.posed else now.pose
+                try:
+                    new = self.state(trial, moved, now.q)
+                except SimulationError:  # too far at once: damped more, the next trial is nearer
+                    fall = -np.inf
+                else:
+                    fall = now.objective - new.objective
+                if fall > 0.0:
+                    hoped = -float(step @ (2.0 * right + normal @ step))
+                    damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * fall / hoped - 1.0) ** 3), 2.0
+                else:
+                    damping, growth = damping * growth, 2.0 * growth
+            if fall <= 0.0:
+                return now
+            now = new
 
-    def objective(q: Array, at: Array) -> float:
-        return float(((weight * gap_of(q)) ** 2).sum() + (at[nodes] * (precision @ at[nodes])).sum())
 
-    q = equilibrium(force, None)
-    value = objective(q, force)
-    damping = FIRST_DAMPING
-    prior = np.kron(precision, np.eye(3))
-    while True:
-        jacobian = weight[:, None] * _marker_jacobian(simulator, markers, nodes, q, seen)
-        system = jacobian.T @ jacobian + prior
-        right = jacobian.T @ (weight * gap_of(q)) + prior @ force[nodes].ravel()
-        fall = -np.inf
-        while fall <= 0.0 and damping <= LAST_DAMPING:
-            trial = force.copy()
-            trial[nodes] -= np.linalg.solve(system + damping * prior, right).reshape(-1, 3)
-            try:
-                trial_q = equilibrium(trial, q)
-            except SimulationError:  # too far at once: damped more, the next trial is nearer
-                fall = -np.inf
-            else:
-                fall = value - objective(trial_q, trial)
-            damping *= 0.1 if fall > 0.0 else 10.0
-        if fall <= 0.0:
-            break
-        q, force, value = trial_q, trial, value - fall
-        if damping < 1.0 and fall < CONVERGED * value:
-            break
-    observed = sigma[seen].ravel() < 10.0 * np.median(sigma[seen])
-    residual = float(np.sqrt((gap_of(q)[observed] ** 2).mean() * 3.0))
-    return InitialState(q, force, residual)
+def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> Array:
+    """Velocities of the mesh [m/s], (N, 3), that give the markers theirs, as changing virtual forces would.
+
+    Args:
+        frame: what was seen, and the nodes that forces act on.
+        q: the mesh in the first frame [m], (N, 3).
+        velocity, sigma: of the markers and their standard deviations [m/s], (M, 3); NaN and infinite where not known.
+    """
+    slopes = marker_slopes(frame, q)
+    known = np.isfinite(velocity[frame.seen]).ravel() & np.isfinite(sigma[frame.seen]).ravel()
+    weight = 1.0 / sigma[frame.seen].ravel()[known]
+    own = weight[:, None] * slopes[known]
+    local = SURFACE_SIGMA if frame.everywhere else LOCAL_SIGMAS[1]
+    prior = np.kron(force_precision(frame.simulator.mesh.vertices[frame.nodes], local), np.eye(3)) / QUICK**2
+    right = own.T @ (weight * velocity[frame.seen].ravel()[known])
+    change = np.zeros_like(q)
+    change[frame.nodes] = np.linalg.solve(own.T @ own + prior, right).reshape(-1, 3)
+    return frame.simulator.solve_tangent(q[None], change[None])[0]
 
 
-def _force_precision(places: Array) -> Array:
+def force_precision(places: Array, local: float) -> Array:
     """Inverse prior covariance of one component of the forces on nodes at `places` (L, 3), (L, L)."""
     modes = np.column_stack([np.ones(len(places)), (places - places.mean(0)) / np.ptp(places, axis=0).max()])
     u, s, _ = np.linalg.svd(modes, full_matrices=False)
     u = u[:, s > 1e-9 * s[0]]
     linear = u @ u.T
-    return linear / LINEAR_SIGMA**2 + (np.eye(len(places)) - linear) / LOCAL_SIGMA**2
+    return linear / LINEAR_SIGMA**2 + (np.eye(len(places)) - linear) / local**2
 
 
-def _marker_jacobian(
-    simulator: Simulator, markers: Markers, nodes: NDArray[np.int64], q: Array, seen: NDArray[np.bool_]
-) -> Array:
-    """Derivative of the seen markers (3 M') by the forces on the nodes (3 L) [m/N]."""
-    by_q = torch.autograd.functional.jacobian(markers.positions, torch.from_numpy(q), vectorize=True).numpy()
-    rows = by_q[seen].reshape(-1, *q.shape)  # (3 M', N, 3)
-    solved = simulator.solve_tangent(q[None], np.moveaxis(rows, 0, -1)[None])[0]
-    return np.moveaxis(solved[nodes], -1, 0).reshape(len(rows), -1)
+def marker_slopes(frame: FirstFrame, q: Array) -> Array:
+    """Derivatives of the seen markers (3 M') by the forces on the nodes (3 L) at equilibrium q [m/N]."""
+    seen = np.flatnonzero(frame.seen)
+    by_corner = frame.markers.slopes(torch.from_numpy(q)).numpy()[seen]  # (M', 3, 4, 3)
+    rows = np.zeros((len(seen), 3, *q.shape))
+    for corner in range(4):
+        rows[np.arange(len(seen)), :, frame.markers.quad[seen, corner]] += by_corner[:, :, corner]
+    solved = frame.simulator.solve_tangent(q[None], np.moveaxis(rows.reshape(-1, *q.shape), 0, -1)[None])[0]
+    return np.moveaxis(solved[frame.nodes], -1, 0).reshape(3 * len(seen), -1)
+
+
+def _pose_slopes(points: Array) -> Array:
+    """Derivatives of posed points (3 M') by a turn (3) and a shift (3) that follow the pose."""
+    turn = np.cross(np.eye(3)[None], points[:, None]).swapaxes(1, 2)  # (M', 3, axis)
+    return np.concatenate([turn, np.broadcast_to(np.eye(3), turn.shape)], axis=2).reshape(-1, 6)

@@ -10,7 +10,8 @@ from rich.console import Console
 from rich.table import Table
 
 from groundwork import InputError, command_line, progress, user_command, write_text
-from rafl.dataset import Dataset, read_dataset
+from rafl.dataset import Dataset
+from rafl.dataset_file import read_dataset
 from rafl.errors import SimulationError
 from rafl.evaluation import (
     Comparison,

@@ -1,27 +1,20 @@
-"""The dataset file: one specimen's mesh, markers and recorded trajectories (see datasets/README.md)."""
+"""One specimen's mesh, markers and recorded trajectories."""
 
-import datetime
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from groundwork import VERSION, InputError, check_format, require_file, whole_file
 from rafl.markers import Markers
-from rafl.material import Material
-from rafl.mesh import HexMesh
 from rafl.rollout import Start
 from rafl.simulator import Simulator
 
 Array = NDArray[Any]
 
-FORMAT = "rafl-dataset/1"
 SPLITS = ("train", "val", "test")
-UNITS = "SI: m, s, kg, N, Pa; specimen frame: origin at a corner of the clamped face, x to the tip, z up"
+UNEVEN = 5e-3  # of the time step: how far times may be from their grid
 
 
 @dataclass(frozen=True)
@@ -87,94 +80,44 @@ class Dataset:
             tuple(recordings),
         )
 
+    def check(self) -> None:
+        """That all parts fit together.
 
-def write_dataset(path: Path, dataset: Dataset) -> None:
-    """Write a dataset file, whole or not at all, with checksums on every array."""
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
-        file.attrs.update(
-            {
-                "format": FORMAT,
-                "name": dataset.name,
-                "units": UNITS,
-                "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-                "software": f"rafl {VERSION}",
-                "recipe": dataset.recipe,
-                "time_step": dataset.simulator.time_step,
-                "gravity": dataset.simulator.gravity,
-                "integrator": dataset.simulator.integrator,
-                "substeps": dataset.simulator.substeps,
-            }
-        )
-        mesh, material, markers = dataset.simulator.mesh, dataset.simulator.material, dataset.markers
-        _put(file, "mesh/vertices", mesh.vertices)
-        _put(file, "mesh/hexes", mesh.hexes)
-        _put(file, "mesh/fixed", dataset.simulator.fixed)
-        file.create_group("material").attrs.update(vars(material))
-        for key in ("rest", "quad", "weights", "normal_offset"):
-            _put(file, f"markers/{key}", getattr(markers, key))
-        file["markers/names"] = np.array(markers.names, dtype=h5py.string_dtype())
-        for name, item in dataset.trajectories.items():
-            for key in ("time", "markers", "valid", "sigma", "load", "added_mass"):
-                _put(file, f"trajectories/{name}/{key}", getattr(item, key))
-            for key in ("q", "v", "virtual_force"):
-                _put(file, f"trajectories/{name}/initial/{key}", getattr(item, key))
-            file[f"trajectories/{name}"].attrs.update({"split": item.split, **item.attributes})
+        Raises:
+            ValueError: one that does not; names it.
+        """
+        mesh, nodes = self.simulator.mesh, len(self.simulator.mesh.vertices)
+        _require(bool(np.isfinite(mesh.vertices).all()), "mesh/vertices", "finite numbers")
+        _require(_indices(mesh.hexes, nodes), "mesh/hexes", f"vertices from 0 to {nodes - 1}")
+        _require(_indices(self.simulator.fixed, nodes), "mesh/fixed", f"vertices from 0 to {nodes - 1}")
+        _require(_indices(self.markers.quad, nodes), "markers/quad", f"vertices from 0 to {nodes - 1}")
+        off = np.abs(self.markers.weights.sum(axis=1) - 1.0)
+        _require(bool((off < 1e-9).all()), "markers/weights", "weights that add up to 1")
+        for name, item in self.trajectories.items():
+            self._check_trajectory(f"trajectories/{name}", item)
 
-
-def _put(file: h5py.File, key: str, value: NDArray) -> None:
-    file.create_dataset(key, data=value, fletcher32=value.size > 0, chunks=value.shape if value.size else None)
+    def _check_trajectory(self, where: str, item: Trajectory) -> None:
+        nodes, frames, count = len(self.simulator.mesh.vertices), len(item.time), len(self.markers.names)
+        shapes = {"markers": (frames, count, 3), "valid": (frames, count), "sigma": (frames, count, 3)}
+        shapes |= dict.fromkeys(("q", "v", "virtual_force", "load"), (nodes, 3)) | {"added_mass": (nodes,)}
+        for key, shape in shapes.items():
+            value = getattr(item, key)
+            _require(value.shape == shape, f"{where}/{key}", f"shape {shape}, found {value.shape}")
+            if key not in ("markers", "valid", "sigma"):
+                _require(bool(np.isfinite(value).all()), f"{where}/{key}", "finite numbers")
+        grid = self.simulator.time_step * np.arange(frames)
+        even = np.abs(item.time - grid) <= UNEVEN * self.simulator.time_step * np.maximum(np.arange(frames), 1)
+        _require(frames > 1 and bool(even.all()), f"{where}/time", "two or more even times from 0 on")
+        seen = item.markers[item.valid]
+        _require(bool(np.isfinite(seen).all()), f"{where}/markers", "finite positions where valid")
+        _require(bool((item.sigma[item.valid] > 0).all()), f"{where}/sigma", "more than 0 where valid")
+        _require(item.split in SPLITS, f"{where}, split", f"{', '.join(SPLITS)}, found {item.split!r}")
 
 
-def read_dataset(path: Path) -> Dataset:
-    """Read and check a dataset file.
-
-    Raises:
-        InputError: no such file, not a dataset, a newer version, or a part missing or damaged.
-    """
-    require_file(path, "a dataset (.h5)")
-    try:
-        with h5py.File(path, "r") as file:
-            check_format(str(file.attrs.get("format", "")), FORMAT, path)
-            dataset = _read(file)
-    except (OSError, KeyError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"expected a dataset written by rafl-capture in {path}, which cannot be read: {reason}; build it again"
-        ) from None
-    if not dataset.trajectories:
-        raise InputError(f"expected at least one trajectory in {path}, found none; run rafl-capture again")
-    return dataset
+def _require(holds: bool, where: str, what: str) -> None:
+    if not holds:
+        raise ValueError(f"{where}: expected {what}")
 
 
-def _read(file: h5py.File) -> Dataset:
-    mesh = HexMesh(file["mesh/vertices"][()], file["mesh/hexes"][()])
-    gx, gy, gz = (float(g) for g in file.attrs["gravity"])
-    simulator = Simulator(
-        mesh,
-        Material(**{key: _plain(value) for key, value in file["material"].attrs.items()}),
-        file["mesh/fixed"][()],
-        float(file.attrs["time_step"]),
-        (gx, gy, gz),
-        str(file.attrs.get("integrator", "implicit-euler")),
-        int(file.attrs.get("substeps", 1)),
-    )
-    keys = ("rest", "quad", "weights", "normal_offset")
-    names = tuple(name.decode() for name in file["markers/names"][()])
-    markers = Markers(names, *(file[f"markers/{key}"][()] for key in keys))
-    trajectories = {}
-    for name, group in file.get("trajectories", {}).items():
-        item = Trajectory(
-            **{key: group[key][()] for key in ("time", "markers", "valid", "sigma", "load", "added_mass")},
-            **{key: group["initial"][key][()] for key in ("q", "v", "virtual_force")},
-            split=str(group.attrs["split"]),
-            attributes={key: _plain(value) for key, value in group.attrs.items() if key != "split"},
-        )
-        frames = (len(item.time), len(names), 3)
-        if item.markers.shape != frames or item.q.shape != mesh.vertices.shape:
-            raise ValueError(f"trajectory {name} has markers {item.markers.shape}, expected {frames}")
-        trajectories[name] = item
-    return Dataset(str(file.attrs["name"]), simulator, markers, trajectories, str(file.attrs["recipe"]))
-
-
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
+def _indices(values: NDArray[np.int64], count: int) -> bool:
+    return bool(((values >= 0) & (values < count)).all())

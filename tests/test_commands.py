@@ -12,10 +12,12 @@ from support import Run, assert_refused, picture
 
 from calibration.camera import OrthographicCamera, Plane
 from calibration.rig import Rig, write_rig
-from capture.build import CaptureSettings, RecordingRow, build_dataset
+from capture.build import CaptureSettings, build_dataset
 from capture.motion import tip_load_release
 from capture.specimen import Specimen
-from rafl.dataset import Dataset, write_dataset
+from capture.table import RecordingRow
+from rafl.dataset import Dataset
+from rafl.dataset_file import write_dataset
 from rafl.global_residual import GlobalResidual
 from rafl.mesh import HexMesh
 from rafl.run import FittedModel, save_model
@@ -138,7 +140,7 @@ def built(small_specimen: Specimen, tmp_path_factory: pytest.TempPathFactory) ->
     return build_dataset(small_specimen, authors_arrays(small_specimen, folder), ROWS, SETTINGS, "", lambda: None)
 
 
-SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0, None, True)
+SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0)
 ROWS = [
     RecordingRow(recording="q0", load_g=50, split="train"),
     RecordingRow(recording="q1", load_g=70, split="test"),
@@ -191,10 +193,37 @@ def test_a_failed_capture_leaves_the_old_dataset(
     table.write_text("recording,load_g,split\nq0,50,train\n")
     line = ("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
     assert run(*line).returncode == 0
+    assert "data:image/png" in (tmp_path / "a.html").read_text()
     before = (tmp_path / "a.h5").read_bytes()
     (tmp_path / "q0.npy").write_bytes(b"broken")
     assert_refused(run(*line), "q0.npy", "cannot be read")
     assert (tmp_path / "a.h5").read_bytes() == before
+
+
+def test_a_dataset_is_looked_at_verified_and_added_to(
+    small_specimen: Specimen, specimen_file: Path, run: Run, tmp_path: Path
+) -> None:
+    authors_arrays(small_specimen, tmp_path)
+    table = tmp_path / "recordings.csv"
+    table.write_text("recording,load_g,split\nq0,50,train\n")
+    line = ("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
+    assert run(*line).returncode == 0
+    table.write_text("recording,load_g,split\nq1,70,test\n")
+    assert_refused(run(*line), "split `train`")
+    assert run(*line, "--update").returncode == 0
+    said = run("rafl-capture", "--inspect", "a.h5")
+    assert said.returncode == 0, said.stderr
+    for part in ("small: 63 vertices, 24 elements", "train 1, val 0, test 1", "q0.npy", "E = 150000 Pa", "SI: m, s"):
+        assert part in " ".join(said.stdout.split()), said.stdout
+    assert "as they were written" in run("rafl-capture", "--verify", "a.h5").stdout
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        file["trajectories/q1"].attrs["load_g"] = 71.0
+    assert_refused(run("rafl-capture", "--verify", "a.h5"), "trajectories/q1 changed")
+    assert_refused(run("rafl-capture", "--verify", specimen_file), "cannot be read")
+    assert_refused(run("rafl-capture", "--inspect", "nowhere.h5"), "nowhere.h5")
+    assert_refused(run("rafl-capture", specimen_file), "for instance rafl-capture")
+    assert_refused(run(*line, "--update", "--rest", "q0:x"), "straight:12-40")
+    assert_refused(run(*line[:-1], "new.h5", "--update"), "new.h5", "nothing there")
 
 
 def test_fit_and_eval_refuse(built: Dataset, run: Run, tmp_path: Path) -> None:

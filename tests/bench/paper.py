@@ -24,7 +24,8 @@ from rich.table import Table
 
 from capture.specimen import read_specimen
 from groundwork import write_text
-from rafl.dataset import Dataset, read_dataset, write_dataset
+from rafl.dataset import Dataset
+from rafl.dataset_file import read_dataset, write_dataset
 from rafl.evaluation import compare, split_table
 from rafl.fit import Item, batches, mean_error
 from rafl.material import Material

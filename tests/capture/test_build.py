@@ -7,16 +7,18 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from capture.build import CaptureSettings, RecordingRow, build_dataset, read_recording_rows
+from capture.build import CaptureSettings, build_dataset
 from capture.motion import tip_load_release
+from capture.registration import RestPose
 from capture.specimen import Specimen
+from capture.table import RecordingRow, read_recording_rows
 from groundwork import InputError
 from rafl.dataset import Dataset
 from rafl.synthetic import load_force
 from tracking.layout import MarkerLayout
 from tracking.tracks import Tracks, write_tracks
 
-SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0, None, True)
+SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0)
 FRAMES = 8
 LAB = (Rotation.from_rotvec([0.3, -0.8, 1.2]).as_matrix(), np.array([0.4, -0.1, 1.5]))
 
@@ -86,15 +88,80 @@ def test_motion_capture_in_the_frame_of_a_moving_clamp(
     assert np.abs(still.markers - truth[1:]).max() > 5e-4
 
 
-def test_a_rest_frame_registers_files_without_a_clamp(
+def test_a_rest_pose_registers_files_without_a_clamp(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
-    write_c3d(tmp_path / "q0.c3d", list(small_specimen.layout.names), in_the_lab(truth))
-    with pytest.raises(InputError, match="way to the specimen frame"):
-        build(small_specimen, tmp_path)
-    settings = replace(SETTINGS, rest=("q0", 0))
-    item = build(small_specimen, tmp_path, settings, first_frame=1).trajectories["q0"]
-    np.testing.assert_allclose(item.markers, truth[1:], atol=1e-6)
+    """From a recording of its own or some of its frames, averaged."""
+    names, random = list(small_specimen.layout.names), np.random.default_rng(2)
+    write_c3d(tmp_path / "q0.c3d", names, in_the_lab(truth[1:]))
+    straight = np.broadcast_to(truth[:1], (30, *truth.shape[1:])) + random.normal(0, 1e-4, (30, *truth.shape[1:]))
+    write_c3d(tmp_path / "straight.c3d", names, in_the_lab(np.concatenate([truth[5:], straight])))
+    many = build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("straight", 4, 33))).trajectories["q0"]
+    one = build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("straight", 4, 4))).trajectories["q0"]
+    off = [np.abs(item.markers - truth[1:]).max() for item in (many, one)]
+    assert off[0] < 3e-5
+    assert off[0] < 0.5 * off[1]
+    assert many.attributes["registration"] == "rest pose"
+    spread = np.sqrt(np.diag(np.asarray(many.attributes["registration_covariance"])))
+    assert spread[3:].max() < 2e-4
+    with pytest.raises(InputError, match="frames within 0 to 33"):
+        build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("straight", 4, 34)))
+    with pytest.raises(InputError, match=r"recording nowhere.*nowhere\.h5"):
+        build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("nowhere")))
+
+
+def test_without_a_rest_pose_the_model_finds_the_frame(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    """The first frame is bent by 60 g and nobody says how the lab's axes lie."""
+    write_c3d(tmp_path / "q0.c3d", list(small_specimen.layout.names), in_the_lab(truth[1:]))
+    item = build(small_specimen, tmp_path).trajectories["q0"]
+    assert str(item.attributes["registration"]).startswith("through the model")
+    assert np.abs(item.markers - truth[1:]).max() < 5e-4
+    assert item.attributes["fit_residual_mm"] < 0.05
+
+
+def test_a_wrong_marker_is_set_aside_by_name(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    off = truth.copy()
+    off[:, 6] += [0.0, 0.004, 0.003]
+    np.save(tmp_path / "q0.npy", 1e3 * in_the_lab(off))
+    item = build(small_specimen, tmp_path).trajectories["q0"]
+    assert item.attributes["set_aside"] == small_specimen.layout.names[6]
+    assert not item.valid[:, 6].any()
+    seen = np.arange(20) != 6
+    np.testing.assert_allclose(item.markers[:, seen], truth[1:, seen], atol=1e-9)
+
+
+def test_the_rest_before_the_release_is_averaged(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    """Twenty frames held still, with noise: the first frame's shape is better known than by one of them."""
+    random = np.random.default_rng(4)
+    held = np.repeat(truth[1:2], 20, axis=0)
+    recorded = np.concatenate([truth[:1], held, truth[2:]])
+    recorded[1:] += random.normal(0, 5e-5, recorded[1:].shape)
+    np.save(tmp_path / "q0.npy", 1e3 * recorded)
+    found = build(small_specimen, tmp_path)
+    item = found.trajectories["q0"]
+    assert (item.attributes["first_frame"], item.attributes["first_frame_from"]) == (19, "the motion")
+    assert int(str(item.attributes["still_frames"])) >= 15
+    assert len(item.time) == FRAMES
+    exact = found.markers.positions(torch.from_numpy(item.q)).numpy()
+    assert np.sqrt(((exact - truth[1]) ** 2).mean()) < 2.5e-5
+    given = build(small_specimen, tmp_path, replace(SETTINGS, start=21)).trajectories["q0"]
+    assert (given.attributes["first_frame"], len(given.time)) == (21, FRAMES - 2)
+
+
+def test_a_recording_that_starts_in_motion(small_specimen: Specimen, tmp_path: Path) -> None:
+    """Positions and velocities of all vertices, from markers alone, in the midst of a swing."""
+    fine = tip_load_release(small_specimen, small_specimen.material, 0.06, 300, 1000.0).q
+    markers = small_specimen.markers(1e-6).positions(torch.from_numpy(fine[::10])).numpy()
+    np.save(tmp_path / "q0.npy", 1e3 * np.concatenate([small_specimen.layout.positions[None], markers]))
+    settings = replace(SETTINGS, initial="moving", forces="surface", start=6)
+    item = build(small_specimen, tmp_path, settings).trajectories["q0"]
+    velocity = (fine[61] - fine[59]) / 2e-3
+    assert np.abs(item.q - fine[60]).max() < 1e-4
+    assert np.linalg.norm(item.v - velocity) < 0.05 * np.linalg.norm(velocity)
+    at_rest = build(small_specimen, tmp_path, replace(SETTINGS, start=6)).trajectories["q0"]
+    assert np.abs(at_rest.v).max() == 0.0
 
 
 def test_tracks_are_taken_as_they_are_unless_they_cannot_be(
@@ -188,4 +255,4 @@ def test_spreadsheet_habits_are_read(tmp_path: Path) -> None:
     path = tmp_path / "recordings.csv"
     path.write_bytes(b"\xef\xbb\xbfrecording, load_g, split, first_frame\r\na, 50, train,\r\nb, 60, test, 3\r\n")
     rows = read_recording_rows(path)
-    assert [(row.recording, row.load_g, row.first_frame) for row in rows] == [("a", 50, 0), ("b", 60, 3)]
+    assert [(row.recording, row.load_g, row.first_frame) for row in rows] == [("a", 50, None), ("b", 60, 3)]

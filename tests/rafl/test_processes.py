@@ -9,7 +9,8 @@ import pandas as pd
 import pytest
 import torch
 
-from rafl.dataset import Dataset, write_dataset
+from rafl.dataset import Dataset
+from rafl.dataset_file import write_dataset
 from rafl.run import load_model
 
 PROGRAM = Path(sys.executable).parent

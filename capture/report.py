@@ -1,0 +1,94 @@
+"""The report of a dataset: its mesh, how recordings were registered, and their first frames, on one page."""
+
+from pathlib import Path
+
+import jinja2
+import matplotlib.pyplot as plt
+import numpy as np
+
+from capture.page import warnings
+from capture.specimen import Specimen
+from groundwork import write_text
+from rafl.dataset import Dataset
+from rafl.pictures import bodies
+
+MOST_PICTURES = 9  # first frames shown
+A_ROW = 3
+
+PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}</title>
+<style>
+ body{font:16px/1.5 system-ui,sans-serif;max-width:66rem;margin:2rem auto;padding:0 1rem;color:#222}
+ table{border-collapse:collapse;margin:1rem 0}
+ th,td{padding:.25rem .8rem;text-align:right;border-bottom:1px solid #ddd}
+ td:first-child,th:first-child{text-align:left}
+ img{max-width:100%} .note{color:#666} .worse{color:#c0392b}
+</style>
+<h1>Dataset {{ name }}</h1>
+{% for line in warnings %}<p class="worse">{{ line }}</p>{% endfor %}
+<h2>The mesh</h2>
+<p>{{ mesh }}</p>
+<img alt="mesh with markers" src="data:image/png;base64,{{ picture }}">
+<h2>Recordings</h2>
+<p class="note">Registration: how far markers were from their places when brought into the specimen's frame, at worst.
+First frame: how far the fitted mesh's markers are from the recorded ones, root mean square.</p>
+<table><tr><th>recording</th><th>split</th><th>load [g]</th><th>frames</th><th>seen</th><th>begins at frame</th>
+<th>by</th><th>frames averaged</th><th>registered by</th><th>registration [mm]</th><th>first frame [mm]</th></tr>
+{% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
+<h2>First frames</h2>
+<p class="note">Blue: the fitted mesh; red: recorded markers.
+{% if left_out %}{{ left_out }} further recordings are not shown.{% endif %}</p>
+{% for image in first_frames %}<img alt="first frames" src="data:image/png;base64,{{ image }}">{% endfor %}
+<h2>Residual of every marker [mm]</h2>
+<p class="note">In the first frame, by recording.</p>
+<table><tr><th>marker</th>{% for name in names %}<th>{{ name }}</th>{% endfor %}</tr>
+{% for row in residuals %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
+<h2>Registration</h2>
+<p class="note">How far from its place every marker was that shows the frame, mm; how sure the pose is.</p>
+<ul>{% for line in registrations %}<li>{{ line }}</li>{% endfor %}</ul></html>
+"""
+
+
+def write_dataset_report(path: Path, specimen: Specimen, dataset: Dataset) -> None:
+    """Write the report of a dataset that was just built."""
+    plt.switch_backend("agg")
+    mesh, items = dataset.simulator.mesh, dataset.trajectories
+    filled = float(mesh.volumes.sum()) / specimen.volume
+    shown = [(name, item.q, item.markers[0]) for name, item in items.items()][:MOST_PICTURES]
+    off = {name: np.asarray(item.attributes["fit_markers_mm"], dtype=float) for name, item in items.items()}
+    text = (
+        jinja2.Environment(autoescape=True)
+        .from_string(PAGE)
+        .render(
+            name=dataset.name,
+            warnings=warnings(dataset),
+            mesh=f"{len(mesh.vertices)} vertices, {len(mesh.hexes)} elements, {len(dataset.simulator.fixed)} vertices "
+            f"held. They fill {filled:.1%} of the shape's volume.",
+            picture=bodies(mesh, [("at rest", mesh.vertices, dataset.markers.rest)]),
+            rows=[_row(name, dataset) for name in items],
+            first_frames=[bodies(mesh, shown[k : k + A_ROW]) for k in range(0, len(shown), A_ROW)],
+            left_out=len(items) - len(shown),
+            names=list(items),
+            residuals=[
+                [marker, *(f"{values[k]:.3f}" if np.isfinite(values[k]) else "-" for values in off.values())]
+                for k, marker in enumerate(dataset.markers.names)
+            ],
+            registrations=[_registration(name, item.attributes) for name, item in items.items()],
+        )
+    )
+    write_text(path, text)
+
+
+def _row(name: str, dataset: Dataset) -> list[object]:
+    item, values = dataset.trajectories[name], dataset.trajectories[name].attributes
+    return [
+        name, item.split, f"{values['load_g']:g} {values['load']}", len(item.time), f"{item.valid.mean():.1%}",
+        values["first_frame"], values["first_frame_from"], values["still_frames"], values["registration"],
+        f"{values['registration_residual_mm']:.3f}", f"{values['fit_residual_mm']:.3f}",
+    ]  # fmt: skip
+
+
+def _registration(name: str, values: dict[str, object]) -> str:
+    spread = np.sqrt(np.diag(np.asarray(values["registration_covariance"], dtype=float)))
+    turn, shift = np.degrees(np.linalg.norm(spread[:3])), 1e3 * np.linalg.norm(spread[3:])
+    sure = f"; turn +- {turn:.3f} degrees, shift +- {shift:.3f} mm" if np.isfinite(spread).all() else ""
+    return f"{name}: by {values['registration']}: {values['registration_markers'] or 'no marker needed'}{sure}"
