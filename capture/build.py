@@ -140,7 +140,8 @@ def _trajectory(
     sigma = registration.pose.turned_sigma(sigma)
     wrong = [k for k, name in enumerate(specimen.layout.names) if name in registration.wrong]
     position[:, wrong] = np.nan
-    release, given = _release(position, row, settings)
+    # As recorded: where a clamp marker jumps, a still specimen only seems to move in the clamp's frame.
+    release, given = _release(item.position[:, :skin], row, settings)
     last = len(item.time) - 1 if row.last_frame is None else row.last_frame
     if not release.start < last < len(item.time):
         raise InputError(

@@ -18,7 +18,7 @@ Array = NDArray[Any]
 # nodes (a pull and a moment), and of the rest, which would dent the mesh to please single markers:
 # first none of it, then little, then more where that halves what is left.
 LINEAR_SIGMA, LOCAL_SIGMAS = 1.0, (1e-5, 5e-3, 5e-2)
-SURFACE_SIGMA = 0.1  # of every force, where forces act all over the surface
+SURFACE_SIGMA = 0.3  # of every force, where forces act all over the surface
 FIRST_DAMPING, LAST_DAMPING = 1e4, 1e16  # of a step, as a multiple of the prior
 QUICK = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
 CONVERGED, ENOUGH = 1e-4, 1e-3  # the search ends where a whole step promises less, of the objective and at all

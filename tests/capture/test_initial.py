@@ -62,18 +62,20 @@ def test_noise_of_five_micrometres(local: float) -> None:
     assert np.linalg.norm(found.q - truth, axis=1).max() < (5e-5 if local == 0.0 else 5e-4)
 
 
-def test_forces_all_over_the_surface_reach_what_the_tip_cannot(small_specimen: Specimen) -> None:
-    """A twist held by hand along the whole body."""
-    simulator, markers = small_specimen.simulator(0.01), small_specimen.markers(1e-6)
-    truth = twisted(simulator.mesh, np.array([0.5]))[0]
+def test_forces_all_over_the_surface_reach_what_the_tip_cannot() -> None:
+    """A twist held by hand along the whole canonical beam."""
+    specimen = read_specimen(CANONICAL)
+    simulator, markers = specimen.simulator(0.01), specimen.markers(1e-6)
+    truth = twisted(simulator.mesh, np.array([1.0]))[0]
     target = markers.positions(torch.from_numpy(truth)).numpy()
     sigma = np.full_like(target, 2e-5)
     surface = np.setdiff1d(np.unique(simulator.mesh.surface), simulator.fixed)
-    tip = fit_first_frame(FirstFrame(simulator, markers, small_specimen.loaded, target, sigma, "test"))
+    tip = fit_first_frame(FirstFrame(simulator, markers, specimen.loaded, target, sigma, "test"))
     all_over = fit_first_frame(FirstFrame(simulator, markers, surface, target, sigma, "test", everywhere=True))
     near, far = (np.linalg.norm(found.q - truth, axis=1).max() for found in (all_over, tip))
-    assert near < 1e-3
-    assert near < 0.5 * far
+    assert near < 1.5e-3
+    assert near < 0.6 * far
+    assert all_over.residual < 0.5 * tip.residual
 
 
 def test_the_slow_way_finds_the_same_shape(small_specimen: Specimen) -> None:
