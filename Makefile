@@ -7,7 +7,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 # BLAS threads fight the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking bench-paper bench-capture clean
+.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking bench-paper bench-capture bench-sim2real clean
 
 install: $(VENV)/installed
 
@@ -61,6 +61,10 @@ bench-tracking: install
 # The paper's sim-to-sim studies, hours: make bench-paper; QUICK=1 for a short form. Resumable.
 bench-paper: install
 	$(BIN)/python tests/bench/paper.py $(if $(QUICK),--quick,--results datasets/results) $(if $(wildcard $(TAIL)),--tail-cells $(TAIL))
+
+# The sim-to-real study with a stricter simulator as the lab, hours: make bench-sim2real; QUICK=1 for a short form.
+bench-sim2real: install
+	$(BIN)/python tests/bench/sim2real.py $(if $(QUICK),--quick,--results datasets/results)
 
 # The first frame: the direct fit beside the sequence of forces of earlier work.
 bench-capture: install

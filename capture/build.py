@@ -134,12 +134,10 @@ def _trajectory(
     settings: CaptureSettings,
 ) -> Trajectory:  # fmt: skip
     """One recording on an even grid of times from its release on, its first frame fitted."""
-    skin = len(specimen.layout.names)
-    simulator = dataset.simulator
-    position, sigma = registration.pose.apply(item.position[:, :skin]), item.sigma[:, :skin]
-    sigma = registration.pose.turned_sigma(sigma)
-    wrong = [k for k, name in enumerate(specimen.layout.names) if name in registration.wrong]
-    position[:, wrong] = np.nan
+    skin, simulator = len(specimen.layout.names), dataset.simulator
+    position = registration.pose.apply(item.position[:, :skin])
+    sigma = registration.pose.turned_sigma(item.sigma[:, :skin])
+    position[:, [name in registration.wrong for name in specimen.layout.names]] = np.nan
     # As recorded: where a clamp marker jumps, a still specimen only seems to move in the clamp's frame.
     release, given = _release(item.position[:, :skin], row, settings)
     last = len(item.time) - 1 if row.last_frame is None else row.last_frame
@@ -148,37 +146,18 @@ def _trajectory(
             f"recording {row.recording}: expected frames within 0 to {len(item.time) - 1}, found {release.start} to "
             f"{last}; correct recordings.csv"
         )
-    still = slice(release.still, max(release.start, release.still + 1))
-    target, target_sigma = mean_position(position[still], sigma[still])
-    if np.isfinite(target[:, 0]).sum() < FEWEST_MARKERS:
-        raise InputError(
-            f"recording {row.recording}, frame {release.start}: expected at least {FEWEST_MARKERS} markers, found "
-            "fewer; start at a later first_frame"
-        )
-    everywhere = settings.forces == "surface"
-    free_surface = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
-    nodes = free_surface if everywhere else specimen.loaded
-    frame = FirstFrame(simulator, dataset.markers, nodes, target, target_sigma, row.recording, everywhere)
-    if settings.initial == "sequence":
-        if registration.guessed:
-            raise InputError(f"recording {row.recording}: --initial sequence needs a rest pose; give --rest")
-        initial = fit_by_sequence(frame)
-    else:
-        initial = fit_first_frame(frame, guess_pose(specimen, target) if registration.guessed else None)
-    _check_first(initial, settings, row.recording)
-    if registration.guessed:
-        position, sigma = initial.pose.apply(position), initial.pose.turned_sigma(sigma)
+    frame = _first_frame(dataset, specimen, position, sigma, release, row.recording, settings.forces == "surface")
+    initial = _fitted(frame, specimen, registration, settings)
+    position, sigma = initial.pose.apply(position), initial.pose.turned_sigma(sigma)
     velocity = np.zeros_like(initial.q)
     if settings.initial == "moving":
         velocity = fit_velocity(frame, initial.q, *_marker_velocity(position, sigma, item.time, release.start))
-    pose = initial.pose if registration.guessed else registration.pose.at(slice(release.start, release.start + 1))
     load = 1e-3 * row.load_g if row.load == "hanging" else 0.0
     added = np.zeros(len(specimen.mesh.vertices))
     added[specimen.loaded] = load / len(specimen.loaded)
     time, markers, sigma = _on_grid(item, position, sigma, slice(release.start, last + 1), simulator.time_step, row)
-    left = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - (
-        initial.pose.apply(target) if registration.guessed else target
-    )
+    pose = initial.pose if registration.guessed else registration.pose.at(slice(release.start, release.start + 1))
+    left = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - initial.pose.apply(frame.target)
     return Trajectory(
         time, markers, np.isfinite(markers[..., 0]), sigma, initial.q, velocity, initial.force,
         load_force(simulator, specimen.loaded, load), added, row.split,
@@ -204,6 +183,41 @@ def _trajectory(
     )  # fmt: skip
 
 
+def _first_frame(
+    dataset: Dataset, specimen: Specimen, position: Array, sigma: Array, release: Release, name: str, everywhere: bool
+) -> FirstFrame:
+    """The markers where they rest before the release, or in the first frame."""
+    still = slice(release.still, max(release.start, release.still + 1))
+    target, target_sigma = mean_position(position[still], sigma[still])
+    if np.isfinite(target[:, 0]).sum() < FEWEST_MARKERS:
+        raise InputError(
+            f"recording {name}, frame {release.start}: expected at least {FEWEST_MARKERS} markers, found fewer; "
+            "start at a later first_frame"
+        )
+    skin = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
+    nodes = skin if everywhere else specimen.loaded
+    return FirstFrame(dataset.simulator, dataset.markers, nodes, target, target_sigma, name, everywhere)
+
+
+def _fitted(
+    frame: FirstFrame, specimen: Specimen, registration: Registration, settings: CaptureSettings
+) -> InitialState:
+    """The first frame, checked against the tolerance."""
+    if settings.initial != "sequence":
+        initial = fit_first_frame(frame, guess_pose(specimen, frame.target) if registration.guessed else None)
+    elif registration.guessed:
+        raise InputError(f"recording {frame.what}: --initial sequence needs a rest pose, found none; give --rest")
+    else:
+        initial = fit_by_sequence(frame)
+    if initial.residual > settings.fit_tolerance:
+        raise InputError(
+            f"recording {frame.what}: expected a first frame the specimen can be bent into, found its markers "
+            f"{1e3 * initial.residual:.2f} mm off (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); "
+            "check that the calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
+        )
+    return initial
+
+
 def _release(position: Array, row: RecordingRow, settings: CaptureSettings) -> tuple[Release, str]:
     """Where the free motion begins, and who says so."""
     given = settings.start if row.first_frame is None else row.first_frame
@@ -217,15 +231,6 @@ def _release(position: Array, row: RecordingRow, settings: CaptureSettings) -> t
         )
     still = start if settings.initial == "moving" else find_release(position, start).still
     return Release(start, still), "given" if given is not None else "the beginning"
-
-
-def _check_first(initial: InitialState, settings: CaptureSettings, name: str) -> None:
-    if initial.residual > settings.fit_tolerance:
-        raise InputError(
-            f"recording {name}: expected a first frame the specimen can be bent into, found its markers "
-            f"{1e3 * initial.residual:.2f} mm off (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); "
-            "check that the calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
-        )
 
 
 def _marker_velocity(position: Array, sigma: Array, time: Array, start: int) -> tuple[Array, Array]:

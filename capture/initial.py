@@ -34,7 +34,7 @@ class FirstFrame:
         markers: tied to its mesh.
         nodes: that virtual forces act on, (L).
         target: markers [m], (M, 3), NaN where not seen.
-        sigma: their standard deviation [m], (M, 3).
+        sigma: their standard deviation [m], (M, 3); where the pose is sought, alike along all axes.
         what: recording, for messages.
         everywhere: whether the nodes are the whole surface, on each of which a force of its own may act.
     """
@@ -67,7 +67,7 @@ class InitialState:
         q: [m], (N, 3).
         force: virtual nodal forces, gravity excepted [N], (N, 3).
         residual: root mean square marker distance over the observed axes [m].
-        pose: from the recorded frame to the specimen frame.
+        pose: from the frame of the target to the specimen frame; the identity where it was not sought.
     """
 
     q: Array

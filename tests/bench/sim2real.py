@@ -1,0 +1,233 @@
+"""The paper's sim-to-real study with a stricter simulator as the lab: simulated, filmed, tracked, captured, fitted.
+
+    python tests/bench/sim2real.py [--quick] [--out build/sim2real]
+
+Every shape goes down the whole road by the commands a lab types; every model is tested on every shape. Resumable: what
+stands under --out is not made again. --quick takes three shapes, fewer recordings and trains less.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import torch
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from capture.film import film, side_cameras, write_board_images
+from capture.motion import Motion
+from capture.render import Look, Painter
+from capture.specimen import Specimen, read_specimen
+from groundwork import progress, write_text
+from rafl.dataset_file import read_dataset
+from rafl.evaluation import ORIGINAL, compare, error_table, latex_table, split_table
+from rafl.material import Material
+from rafl.mesh import HexMesh
+from rafl.methods import METHODS
+from rafl.run import load_model
+from rafl.synthetic import hung, let_go
+
+DATASETS = Path(__file__).parents[2] / "datasets"
+FPS = 100.0
+DONE = "done"
+TOGETHER = 4  # recordings simulated at once
+
+
+@dataclass(frozen=True)
+class Effort:
+    """How much of everything.
+
+    Attributes:
+        shapes: as many of the study's; all where None.
+        recordings: numbers of recordings to train, to validate and to test with; all where None.
+        frames: of each recording; as the study says where None.
+        epochs: by method.
+    """
+
+    shapes: tuple[str, ...] | None
+    recordings: tuple[int, int, int] | None
+    frames: int | None
+    epochs: dict[str, int]
+
+
+FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 40})
+QUICK = Effort(
+    ("canonical", "thicker-scaled", "shorter"), (3, 1, 2), 50, {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8}
+)
+
+
+def command(name: str, *arguments: object) -> None:
+    line = [str(Path(sys.executable).parent / name), *map(str, arguments)]
+    subprocess.run(line, check=True, stdout=subprocess.DEVNULL, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
+
+
+class Study:
+    """The experiment under one folder."""
+
+    def __init__(self, out: Path, effort: Effort) -> None:
+        self.out, self.effort = out, effort
+        self.plan: dict[str, Any] = yaml.safe_load((DATASETS / "experiments" / "sim2real.yaml").read_text())
+        self.shapes = list(effort.shapes or self.plan["shapes"])
+        self.frames = effort.frames or self.plan["frames"]
+        counts = effort.recordings or tuple(len(self.plan["split"][split]) for split in ("train", "val", "test"))
+        splits = dict(zip(("train", "val", "test"), counts, strict=True))
+        self.split = {number: split for split, count in splits.items() for number in self.plan["split"][split][:count]}
+
+    def specimen(self, shape: str) -> Path:
+        return DATASETS / "specimens" / f"{shape}.yaml"
+
+    def lab(self, shape: str) -> Specimen:
+        """The specimen as the lab has it."""
+        described, lab = read_specimen(self.specimen(shape)), self.plan["lab"]
+        coarse = described.mesh
+        axes = [np.unique(np.round(coarse.vertices[:, k], 9)) for k in range(3)]
+        cells = [lab["refinement"] * (len(axis) - 1) for axis in axes]
+        mesh = HexMesh.box(cells, np.ptp(coarse.vertices, axis=0))
+        return replace(
+            described, mesh=mesh, material=Material(**lab["material"]), fixed=mesh.face_nodes("x-min"),
+            loaded=mesh.face_nodes("x-max"), integrator=lab["integrator"], substeps=lab["substeps"],
+        )  # fmt: skip
+
+    def motions(self, shape: str) -> list[Motion]:
+        """What happens in the lab, from its file where it stands there."""
+        path, lab = self.out / shape / "truth.npy", self.lab(shape)
+        loads = 1e-3 * np.array(self.plan["hung_g"])[list(self.split)]
+        names = tuple(f"load{1e3 * load:03.0f}g" for load in loads)
+        if not path.exists():
+            simulator, parts = lab.simulator(1.0 / FPS), []
+            for k in range(0, len(loads), TOGETHER):
+                print(f"{shape}: releasing {', '.join(names[k : k + TOGETHER])}", flush=True)
+                starts = hung(simulator, lab.loaded, loads[k : k + TOGETHER])
+                parts.append(let_go(simulator, starts, self.frames, names[k : k + TOGETHER]))
+            path.parent.mkdir(parents=True, exist_ok=True)
+            np.save(path.with_suffix(".part.npy"), np.concatenate(parts, axis=1))
+            path.with_suffix(".part.npy").rename(path)
+        truth = np.load(path)
+        time = np.arange(self.frames) / FPS
+        return [Motion(name, load, time, truth[:, b]) for b, (name, load) in enumerate(zip(names, loads, strict=True))]
+
+    def record(self, shape: str) -> None:
+        """Film, calibrate, track and capture."""
+        folder = self.out / shape
+        if (folder / f"{shape}.h5").exists():
+            return
+        motions, lab, look = self.motions(shape), self.lab(shape), Look()
+        random = np.random.default_rng(self.plan["shapes"].index(shape))
+        rig = side_cameras(lab, motions, random)
+        if not (folder / "calib.yaml").exists():
+            shutil.rmtree(folder / "calibration", ignore_errors=True)
+            write_board_images(folder / "calibration", rig, look, random)
+            command("rafl-calibrate", folder / "calibration", "--out", folder / "calib.yaml")
+        with progress() as bar:
+            task = bar.add_task(f"{shape}: filming", total=self.frames * len(motions) * len(rig.cameras))
+            for number, motion in enumerate(motions):
+                for view, (name, camera) in enumerate(rig.cameras.items()):
+                    path = folder / "videos" / motion.name / f"{name}.mp4"
+                    if not path.exists():
+                        painter = Painter.of(lab, camera, look, random)
+                        film(path, motion, painter, FPS, "h264", 97 * number + view, lambda: bar.advance(task))
+        command(
+            "rafl-track", folder / "videos", "--calib", folder / "calib.yaml", "--specimen", self.specimen(shape),
+            "--out", folder / "tracks",
+        )  # fmt: skip
+        rows = [f"{m.name},{1e3 * m.load:g},{split}" for m, split in zip(motions, self.split.values(), strict=True)]
+        write_text(folder / "recordings.csv", "\n".join(["recording,load_g,split", *rows, ""]))
+        command(
+            "rafl-capture", self.specimen(shape), folder / "tracks", "--recordings", folder / "recordings.csv",
+            "--out", folder / f"{shape}.h5",
+        )  # fmt: skip
+
+    def fit(self, shape: str) -> None:
+        """Every method."""
+        for method, epochs in self.effort.epochs.items():
+            run = self.out / shape / method
+            if (run / DONE).exists():
+                continue
+            print(f"{shape}: fitting {method}", flush=True)
+            resume = ["--resume"] if (run / "checkpoint.pt").exists() else []
+            if not resume:
+                shutil.rmtree(run, ignore_errors=True)
+            dataset = self.out / shape / f"{shape}.h5"
+            command("rafl-fit", dataset, "--method", method, "--out", run, "--epochs", epochs, *resume)
+            (run / DONE).touch()
+
+    def tested(self, shape: str) -> tuple[pd.DataFrame, pd.DataFrame]:
+        """Test errors of all models on one shape, by method and the shape trained on; its own by split."""
+        table, own = (self.out / shape / name for name in ("errors.csv", "own.csv"))
+        if not (table.exists() and own.exists()):
+            print(f"{shape}: testing", flush=True)
+            dataset = read_dataset(self.out / shape / f"{shape}.h5")
+            nodes, models = len(dataset.simulator.mesh.vertices), {}
+            for trained in self.shapes:
+                for method in self.effort.epochs:
+                    model = load_model(self.out / trained / method)
+                    if model.network is None or model.network.nodes == nodes:
+                        models[f"{method}@{trained}"] = model
+            comparisons = compare(dataset, models)
+            write_text(table, error_table(comparisons).to_csv(index=False))
+            write_text(own, split_table(comparisons).to_csv(index=False))
+        return pd.read_csv(table), pd.read_csv(own)
+
+
+def show(title: str, table: pd.DataFrame) -> None:
+    printed = Table("", *map(str, table.columns), title=title)
+    for name, row in table.iterrows():
+        printed.add_row(str(name), *map(str, row))
+    Console(width=170).print(printed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--out", type=Path, default=Path("build/sim2real"))
+    parser.add_argument("--results", type=Path, help="folder for the tables")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    study = Study(options.out / ("quick" if options.quick else "full"), QUICK if options.quick else FULL)
+    results = options.results or study.out
+    for shape in study.shapes:
+        study.record(shape)
+        study.fit(shape)
+    tested = {shape: study.tested(shape)[1].query("split == 'test'") for shape in study.shapes}
+    own = []
+    for shape, errors in tested.items():
+        chosen = errors[errors["method"].isin([ORIGINAL, *(f"{method}@{shape}" for method in study.effort.epochs)])]
+        own.append(chosen.assign(method=chosen["method"].str.removesuffix(f"@{shape}")))
+    table = pd.concat(own)
+    write_text(results / "sim2real.csv", table.to_csv(index=False, float_format="%.4f"))
+    write_text(results / "sim2real.tex", latex_table(table))
+    value = table["mean_mm"].map("{:.3f}".format) + " +- " + table["std_mm"].map("{:.3f}".format)
+    shown = table.assign(error=value).pivot(index="dataset", columns="method", values="error").loc[study.shapes]
+    show(
+        "mean marker error on the test recordings of the shape trained on [mm]", shown[[ORIGINAL, *study.effort.epochs]]
+    )
+    rows = []
+    for method in (method for method in METHODS if method in study.effort.epochs):
+        matrix = pd.DataFrame(
+            {
+                shape: errors.set_index("method")["mean_mm"].reindex([f"{method}@{name}" for name in study.shapes])
+                for shape, errors in tested.items()
+            }
+        ).set_axis(study.shapes)
+        original = pd.Series(
+            {shape: errors.set_index("method")["mean_mm"][ORIGINAL] for shape, errors in tested.items()}
+        )
+        apart = ~np.eye(len(matrix), dtype=bool)
+        worse = int((matrix.gt(original, axis="columns") & apart).to_numpy().sum())
+        tried = int((matrix.notna() & apart).to_numpy().sum())
+        show(f"{method}: trained on a row's shape, tested on a column's [mm]", matrix.map("{:.3f}".format))
+        print(f"{method}: negative transfer in {worse} of {tried} pairs of different shapes")
+        rows.append(matrix.rename_axis("trained_on").reset_index().assign(method=method))
+    write_text(results / "sim2real-transfer.csv", pd.concat(rows).to_csv(index=False, float_format="%.4f"))
+
+
+if __name__ == "__main__":
+    main()
