@@ -20,6 +20,7 @@ Array = NDArray[Any]
 LINEAR_SIGMA, LOCAL_SIGMAS = 1.0, (1e-5, 5e-3, 5e-2)
 SURFACE_SIGMA = 0.3  # of every force, where forces act all over the surface
 FIRST_DAMPING, LAST_DAMPING = 1e4, 1e16  # of a step, as a multiple of the prior
+MOST_STEPS = 100
 QUICK = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
 CONVERGED, ENOUGH = 1e-4, 1e-3  # the search ends where a whole step promises less, of the objective and at all
 UNOBSERVED = 10.0  # times the median sigma: an axis that no camera saw
@@ -125,7 +126,8 @@ class _Search:
 
     def __init__(self, frame: FirstFrame, posed: bool, local: float, beyond: float) -> None:
         self.frame, self.posed = frame, posed
-        self.precision = force_precision(frame.simulator.mesh.vertices[frame.nodes], local)
+        precision = force_precision(frame.simulator.mesh.vertices[frame.nodes], local)
+        self.prior = np.kron(precision, np.eye(3))
         self.weight = 1.0 / np.sqrt(frame.sigma[frame.seen].ravel() ** 2 + beyond**2)
 
     def state(self, force: Array, pose: Rigid, start: Array | None) -> _State:
@@ -135,36 +137,22 @@ class _Search:
         q = frame.simulator.equilibrium(total, begin, f"{frame.what}: first frame")[0]
         own = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.seen]
         gap = (own - pose.apply(frame.target[frame.seen])).ravel()
-        at = force[frame.nodes]
-        return _State(force, pose, q, gap, float(((self.weight * gap) ** 2).sum() + (at * (self.precision @ at)).sum()))
+        at = force[frame.nodes].ravel()
+        return _State(force, pose, q, gap, float(((self.weight * gap) ** 2).sum() + at @ self.prior @ at))
 
     def descend(self, force: Array, pose: Rigid, start: Array | None) -> _State:
         """From some forces and pose to the best."""
-        frame, nodes = self.frame, self.frame.nodes
         now = self.state(force, pose, start)
-        prior = np.kron(self.precision, np.eye(3))
-        free = np.zeros((6, 6)) if self.posed else np.zeros((0, 0))
-        penalty = np.block([[prior, np.zeros((len(prior), len(free)))], [np.zeros((len(free), len(prior))), free]])
         damping, growth = FIRST_DAMPING, 2.0  # after H. B. Nielsen
-        while True:
-            slopes = marker_slopes(frame, now.q)
-            if self.posed:
-                slopes = np.concatenate([slopes, -_pose_slopes(now.pose.apply(frame.target[frame.seen]))], axis=1)
-            slopes *= self.weight[:, None]
-            right = slopes.T @ (self.weight * now.gap)
-            right[: len(prior)] += prior @ now.force[nodes].ravel()
-            normal = slopes.T @ slopes + penalty
+        for _ in range(MOST_STEPS):
+            right, normal = self._normal_equations(now)
             if right @ np.linalg.solve(normal, right) < CONVERGED * now.objective + ENOUGH:
-                return now
-            fall = -np.inf
+                break
+            held, fall = self._held(normal), -np.inf
             while fall <= 0.0 and damping <= LAST_DAMPING:
-                held = penalty + np.diag(np.r_[np.zeros(len(prior)), 1e-6 * np.diag(normal)[len(prior) :]])
                 step = np.linalg.solve(normal + damping * held, -right)
-                trial = now.force.copy()
-                trial[nodes] += step[: len(prior)].reshape(-1, 3)
-                moved = now.pose.moved(step[len(prior) :]) if self.posed else now.pose
                 try:
-                    new = self.state(trial, moved, now.q)
+                    new = self._moved(now, step)
                 except SimulationError:  # too far at once: damped more, the next trial is nearer
                     fall = -np.inf
                 else:
@@ -175,8 +163,33 @@ class _Search:
                 else:
                     damping, growth = damping * growth, 2.0 * growth
             if fall <= 0.0:
-                return now
+                break
             now = new
+        return now
+
+    def _normal_equations(self, now: _State) -> tuple[Array, Array]:
+        """Half the objective's gradient by forces (3 L) and pose (6, where it is sought), and half its curvature."""
+        slopes = marker_slopes(self.frame, now.q)
+        if self.posed:
+            posed = now.pose.apply(self.frame.target[self.frame.seen])
+            slopes = np.concatenate([slopes, -_pose_slopes(posed)], axis=1)
+        slopes *= self.weight[:, None]
+        right, normal = slopes.T @ (self.weight * now.gap), slopes.T @ slopes
+        count = len(self.prior)
+        right[:count] += self.prior @ now.force[self.frame.nodes].ravel()
+        normal[:count, :count] += self.prior
+        return right, normal
+
+    def _held(self, normal: Array) -> Array:
+        """What damping multiplies: the prior; of the pose, which has none, a little of its curvature."""
+        held, count = np.diag(1e-6 * np.diag(normal)), len(self.prior)
+        held[:count, :count] = self.prior
+        return held
+
+    def _moved(self, now: _State, step: Array) -> _State:
+        force, count = now.force.copy(), len(self.prior)
+        force[self.frame.nodes] += step[:count].reshape(-1, 3)
+        return self.state(force, now.pose.moved(step[count:]) if self.posed else now.pose, now.q)
 
 
 def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> Array:

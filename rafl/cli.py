@@ -1,7 +1,7 @@
 """The commands `rafl-fit` and `rafl-eval`."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import pandas as pd
 import torch
@@ -70,6 +70,9 @@ def fit(
     by_sigma: Annotated[
         bool, typer.Option("--by-sigma", help="Weigh markers by their uncertainty (rafl, sysid).")
     ] = False,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Write the history for TensorBoard too, into the run folder.")
+    ] = False,
     resume: Annotated[bool, typer.Option(help="Go on with a run that was interrupted.")] = False,
 ) -> None:
     """Train on the `train` recordings, watch the `val` ones, keep the best.
@@ -89,10 +92,12 @@ def fit(
         str(start.resolve()) if start else "", by_sigma,
     )  # fmt: skip
     first = rank() == 0  # of the processes that torchrun started
+    open_writer = _summary_writer() if tensorboard else None
     if first:
         _open_run(run, settings, resume)
         if process_count() > batch:
             typer.echo(f"{process_count()} processes share out {batch}: give --batch to use them all", err=True)
+    writer = open_writer(run) if open_writer and first else None
     with progress() as bar:
         task = bar.add_task("epoch", total=epochs)
 
@@ -104,6 +109,10 @@ def fit(
             if not first:
                 return
             bar.console.print(f"{label} {row[kind]:3.0f}: {values}", highlight=False, soft_wrap=True)
+            if writer is not None:
+                for key, value in row.items():
+                    writer.add_scalar(f"{kind}/{key}", value, int(row[kind]))
+                writer.flush()
 
         try:
             model = METHODS[method](loaded, settings, run, report)
@@ -117,6 +126,18 @@ def fit(
             typer.echo(line)
     typer.echo(f"wrote {run}/ (model.pt, history.csv, config.yaml)")
     typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in datasets)}")
+
+
+def _summary_writer() -> Any:
+    """TensorBoard's writer, where it is installed."""
+    try:
+        from torch.utils.tensorboard import SummaryWriter  # only here: an optional package
+    except ImportError:
+        raise InputError(
+            "--tensorboard: expected the package tensorboard, found none; pip install tensorboard, or do without "
+            "(history.csv holds the same)"
+        ) from None
+    return SummaryWriter
 
 
 def _open_run(run: Path, settings: Settings, resume: bool) -> None:

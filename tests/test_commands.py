@@ -1,5 +1,6 @@
 """What a stranger gets wrong: every command answers in one line, with exit code 2, and writes nothing."""
 
+import importlib.util
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -253,6 +254,18 @@ def test_fit_and_eval_refuse(built: Dataset, run: Run, tmp_path: Path) -> None:
     assert_refused(run("rafl-eval", "run", "a.h5"), "model.pt", "cannot be read")
 
 
+def test_tensorboard_is_written_or_asked_for(built: Dataset, run: Run, tmp_path: Path) -> None:
+    """Where the optional package is absent nothing is written."""
+    write_dataset(tmp_path / "a.h5", built)
+    said = run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1", "--frames", "3", "--tensorboard")
+    if importlib.util.find_spec("tensorboard") is None:
+        assert_refused(said, "package tensorboard", "history.csv")
+        assert not (tmp_path / "run").exists()
+    else:
+        assert said.returncode == 0, said.stderr
+        assert list((tmp_path / "run").glob("events.out.tfevents.*"))
+
+
 def test_a_model_of_another_mesh_is_left_out_and_a_model_of_none_refused(
     built: Dataset, run: Run, tmp_path: Path
 ) -> None:
@@ -290,15 +303,8 @@ def test_what_a_method_cannot_be_fitted_to_is_refused_before_anything_is_written
 ) -> None:
     mesh = HexMesh.box((3, 2, 2), (0.03, 0.02, 0.02))
     other = replace(built.simulator, mesh=mesh, fixed=mesh.face_nodes("x-min"))
-    grown = {
-        name: replace(
-            item, **{key: np.zeros((36, *getattr(item, key).shape[1:])) for key in ("q", "v", "virtual_force")}
-        )
-        for name, item in built.trajectories.items()
-    }
-    grown = {name: replace(item, load=item.q, added_mass=item.q[:, 0]) for name, item in grown.items()}
     write_dataset(tmp_path / "a.h5", built)
-    write_dataset(tmp_path / "b.h5", replace(built, simulator=other, trajectories=grown))
+    write_dataset(tmp_path / "b.h5", released("b", other, other, mesh.vertices[None], 3, {"a": "train"}))
     assert_refused(run("rafl-fit", "a.h5", "b.h5", "--method", "srl", "--out", "run"), "srl", "one mesh", "36")
     assert_refused(run("rafl-fit", "a.h5", "--method", "magic", "--out", "run"), "--method", "sysid-e", "magic")
     assert_refused(run("rafl-fit", "a.h5", "--from", "nowhere", "--out", "run"), "nowhere", "check the path")
