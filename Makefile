@@ -26,8 +26,9 @@ demo: install
 	$(BIN)/rafl-fit $(DEMO)/canonical.h5 --out $(DEMO)/run --epochs 16
 	$(BIN)/rafl-eval $(DEMO)/run $(DEMO)/canonical.h5
 
+# Two workers of one thread each: kernels of several threads in each would fight over the cores.
 test: install lint
-	$(BIN)/pytest
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
 lint: install
 	$(BIN)/ruff check .

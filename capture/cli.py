@@ -24,6 +24,8 @@ from groundwork import InputError, command_line, progress, user_command, write_t
 from rafl.dataset_file import damaged_parts, update_dataset, write_dataset
 from rafl.errors import SimulationError
 
+DRAWN_MM = 1.0  # how far off the skin a marker may stand to be drawn there
+
 render_app = command_line("Film simulated specimens.")
 capture_app = command_line("Build datasets.")
 
@@ -76,6 +78,7 @@ def render(
     Example: rafl-render datasets/specimens/canonical.yaml --out demo
     """
     described = read_specimen(specimen)
+    described.markers(1e-3 * DRAWN_MM, "or choose smaller elements: dots are drawn on the skin of the elements")
     if out.exists() and any(out.iterdir()):
         raise InputError(f"expected a new or empty folder at {out}, found files in it; choose another --out")
     loads, twists = _numbers(loads_g, "--loads-g"), _numbers(twists_deg, "--twists-deg")

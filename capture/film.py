@@ -21,7 +21,7 @@ from calibration.board import CharucoPattern
 from calibration.camera import Camera, OrthographicCamera, Plane
 from calibration.rig import PLANE_SIGMA_MM, Rig, rig_text
 from capture.motion import Motion
-from capture.render import Look, Painter, develop
+from capture.render import Look, Painter, develop, drawn_dots
 from capture.specimen import Specimen
 from groundwork import whole_file, write_text
 
@@ -204,7 +204,7 @@ def _board_picture(
 
 def write_truth(path: Path, specimen: Specimen, motions: list[Motion], rig: Rig, material_text: str) -> None:
     """`truth.h5`: per recording time, marker positions [m], their pixels by camera, and the mesh."""
-    markers = specimen.markers(np.inf)
+    markers = drawn_dots(specimen)
     with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update({"calibration": rig_text(rig), "material": material_text, "specimen": specimen.text})
         file["marker_names"] = np.array(markers.names, dtype=h5py.string_dtype())

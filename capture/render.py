@@ -1,15 +1,17 @@
 """Pictures of a deformed, dotted, lit specimen as an orthographic camera sees it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
 import numpy as np
+import torch
 from numba import njit
 from numpy.typing import NDArray
 
 from calibration.camera import Camera
 from capture.specimen import Specimen
+from rafl.markers import Markers
 
 Array = NDArray[Any]
 
@@ -101,23 +103,26 @@ class Painter:
         camera: through which.
         look: how.
         backdrop: picture of everything that does not move, (H, W) [grey levels].
+        dots: where they are on the skin at rest [mm], (K, 3).
     """
 
     specimen: Specimen
     camera: Camera
     look: Look
     backdrop: Array
+    dots: Array
 
     @classmethod
     def of(cls, specimen: Specimen, camera: Camera, look: Look, random: np.random.Generator) -> "Painter":
         """A painter with its own backdrop."""
-        return cls(specimen, camera, look, _backdrop(specimen, camera, look, random))
+        dots = 1e3 * drawn_dots(specimen).rest
+        return cls(specimen, camera, look, _backdrop(specimen, camera, look, random), dots)
 
     def draw(self, positions: Array, random: np.random.Generator) -> NDArray[np.uint8]:
         """A picture (H, W) of the mesh at positions (samples, N, 3) [m] during the exposure."""
         surface = self.specimen.mesh.surface
         rest = 1e3 * self.specimen.mesh.vertices[surface]
-        dots, touching = self._dots_of_quads(rest)
+        touching = self._dots_of_quads(rest)
         picture = np.zeros_like(self.backdrop)
         softness = 1e-3 * float(np.linalg.norm(self.camera.slopes(self.specimen.mesh.vertices.mean(0))[0]))
         # One place inside the pixel per instant smooths the outline; they average to its centre.
@@ -129,7 +134,7 @@ class Painter:
             order = np.argsort(-depth)
             order = order[facing[order]]
             first = np.concatenate([[0], np.cumsum([len(touching[s]) for s in order])])
-            chosen = [dots[k] for s in order for k in touching[s]]
+            chosen = [self.dots[k] for s in order for k in touching[s]]
             layer = self.backdrop.copy()
             _draw_quads(
                 layer, corners[order], rest[order], self._shade(q[surface[order]]), first,
@@ -138,25 +143,31 @@ class Painter:
             picture += layer / len(positions)
         return develop(picture, self.look, random)
 
-    def _dots_of_quads(self, rest: Array) -> tuple[Array, list[list[int]]]:
-        """Dots [mm] and, for each quad, which of them can reach into it on the same face."""
-        dots = 1e3 * self.specimen.layout.positions
+    def _dots_of_quads(self, rest: Array) -> list[list[int]]:
+        """For each quad (S, 4, 3) [mm], which dots can reach into it on the same face."""
         normal = np.cross(rest[:, 1] - rest[:, 0], rest[:, 3] - rest[:, 0])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         reach = 1e3 * self.look.dot_radius + 0.5
         low, high = rest.min(1) - reach, rest.max(1) + reach
         touching = []
         for s in range(len(rest)):
-            height = np.abs((dots - rest[s, 0]) @ normal[s])
-            inside = ((dots > low[s]) & (dots < high[s])).all(1) & (height < 1e-3)
+            height = np.abs((self.dots - rest[s, 0]) @ normal[s])
+            inside = ((self.dots > low[s]) & (self.dots < high[s])).all(1) & (height < 1e-3)
             touching.append(np.flatnonzero(inside).tolist())
-        return dots, touching
+        return touching
 
     def _shade(self, corners: Array) -> Array:
         normal = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         # A lamp beside the camera and one above: no face is black.
         return 0.55 + 0.3 * np.abs(normal @ self.camera.viewing_direction) + 0.15 * (normal @ LIGHT)
+
+
+def drawn_dots(specimen: Specimen) -> Markers:
+    """The markers as they are drawn: on the skin of the elements, whatever the layout says beyond that."""
+    markers = specimen.markers(np.inf)
+    flat = replace(markers, normal_offset=np.zeros(len(markers.names)))
+    return replace(flat, rest=flat.positions(torch.from_numpy(specimen.mesh.vertices)).numpy())
 
 
 def _zigzag(count: int) -> Array:

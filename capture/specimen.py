@@ -101,8 +101,8 @@ class Specimen:
             substeps=self.substeps,
         )
 
-    def markers(self, tolerance: float) -> Markers:
-        """The markers tied to the mesh.
+    def markers(self, tolerance: float, advice: str = "or allow it with --tolerance-mm") -> Markers:
+        """The markers tied to the mesh; `advice` ends the message where one cannot be.
 
         Raises:
             InputError: a marker stands further than `tolerance` [m] off the surface.
@@ -114,8 +114,7 @@ class Specimen:
             raise InputError(
                 f"specimen {self.name}: marker {markers.names[worst]} at "
                 f"{np.round(1e3 * markers.rest[worst], 3).tolist()} mm lies {1e3 * off[worst]:.2f} mm off "
-                f"the surface, expected at most {1e3 * tolerance:g} mm; correct at_mm, or allow it "
-                "with --tolerance-mm"
+                f"the surface, expected at most {1e3 * tolerance:g} mm; correct at_mm, {advice}"
             )
         return markers
 

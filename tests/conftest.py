@@ -18,7 +18,7 @@ def _forget_stale_kernels() -> None:
         newest = max(path.stat().st_mtime for path in folder.rglob("*.py"))
         for compiled in folder.rglob("*.nb[ic]"):
             if compiled.stat().st_mtime < newest:
-                compiled.unlink()
+                compiled.unlink(missing_ok=True)
 
 
 _forget_stale_kernels()
