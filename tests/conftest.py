@@ -1,5 +1,6 @@
 """Specimens, datasets and recordings that several tests start from."""
 
+import contextlib
 import subprocess
 import sys
 from pathlib import Path
@@ -17,8 +18,9 @@ def _forget_stale_kernels() -> None:
         folder = Path(__file__).parents[1] / package
         newest = max(path.stat().st_mtime for path in folder.rglob("*.py"))
         for compiled in folder.rglob("*.nb[ic]"):
-            if compiled.stat().st_mtime < newest:
-                compiled.unlink(missing_ok=True)
+            with contextlib.suppress(FileNotFoundError):  # another worker was first
+                if compiled.stat().st_mtime < newest:
+                    compiled.unlink()
 
 
 _forget_stale_kernels()

@@ -250,13 +250,13 @@ def main() -> None:
         print(f"negative transfer: {int((worse['rafl'] > worse['original']).sum())} of {len(worse)} shapes")
         tuned = study.fine_tuning()
         show(f"{name}, fine-tuned", tuned)
+        fine.append(tuned.assign(study=name))
+        notes = [machine, f"{name}: fits took {study.seconds()}"]
+        write_table(results / "fine-tuning.csv", pd.concat(fine), notes)
         if name == "vibration":
             left_out = study.leave_one_out()
             show(f"{name}, each shape by the four others", left_out)
             write_table(results / "leave-one-shape-out.csv", left_out, [machine, f"fits took {study.seconds()}"])
-        fine.append(tuned.assign(study=name))
-        notes = [machine, f"{name}: fits took {study.seconds()}"]
-        write_table(results / "fine-tuning.csv", pd.concat(fine), notes)
 
 
 if __name__ == "__main__":
