@@ -24,7 +24,7 @@ from groundwork import InputError, command_line, progress, user_command, write_t
 from rafl.dataset_file import damaged_parts, update_dataset, write_dataset
 from rafl.errors import SimulationError
 
-DRAWN_MM = 1.0  # how far off the skin a marker may stand to be drawn there
+DRAWN_MM = 2.0  # how far off the skin a marker may stand to be drawn there
 
 render_app = command_line("Film simulated specimens.")
 capture_app = command_line("Build datasets.")

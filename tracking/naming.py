@@ -13,23 +13,37 @@ from tracking.layout import MarkerLayout
 Array = NDArray[Any]
 
 NEAR = 0.4  # of the local spacing: how far a dot may be from where its neighbours put it
+BEHIND = 0.3  # of the spacing: a marker nearer than this to one before it in the picture is covered
 TURNS = np.radians(np.concatenate([[0], np.repeat(np.arange(15, 181, 15), 2) * np.tile([1, -1], 12)]))
 
 
 def visible_markers(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
     """Indices of the markers on the side of the specimen that faces the camera.
 
-    The sides are the flat parts of the layout's convex hull; a layout in one plane is all seen.
+    The sides are the flat parts of the layout's convex hull; of a layout in one plane all are seen that do not stand
+    behind another.
     """
     points = layout.positions
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
-        return np.arange(len(points))
+        return _not_behind_others(layout, camera)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
     on = np.abs(points @ normals.T + offsets) < 1e-3 * np.ptp(points, axis=0).max()
     facing = normals @ camera.viewing_direction < -0.5
     return np.flatnonzero((on & facing).any(axis=1))
+
+
+def _not_behind_others(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
+    """Indices of the markers that no nearer marker covers."""
+    pixels = camera.ideal(layout.positions)
+    # Of a marker and its image on the far side the second nearest is a true neighbour.
+    spacing = float(np.median(cKDTree(pixels).query(pixels, min(3, len(pixels)))[0][:, -1]))
+    kept: list[int] = []
+    for marker in np.argsort(layout.positions @ camera.viewing_direction):
+        if all(np.linalg.norm(pixels[marker] - pixels[other]) > BEHIND * spacing for other in kept):
+            kept.append(int(marker))
+    return np.sort(np.array(kept, dtype=np.int64))
 
 
 def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str) -> list[int]:
@@ -50,8 +64,8 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
         InputError: fewer than three dots match the layout.
     """
     markers = visible_markers(layout, camera)
-    if len(dots) > len(markers):  # spheres on stands are seen from behind too
-        markers = np.arange(len(layout.names))
+    if len(dots) > len(markers):  # the skin is hollow there, or spheres on stands are seen from behind
+        markers = _not_behind_others(layout, camera)
     pixels = camera.undistort(dots)
     expected = camera.ideal(layout.positions[markers])
     size = max(float(np.ptp(expected, axis=0).max()), 1.0)

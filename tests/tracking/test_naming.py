@@ -1,10 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 from calibration.camera import OrthographicCamera
 from groundwork import InputError
-from tracking.layout import MarkerLayout
+from tracking.layout import MarkerLayout, read_layout
 from tracking.naming import name_by_layout, name_by_rows, visible_markers
 
 CAMERA = OrthographicCamera(
@@ -41,6 +43,19 @@ def test_only_the_near_side_is_seen() -> None:
     assert visible_markers(LAYOUT, CAMERA).tolist() == list(range(16))
     one_plane = MarkerLayout(LAYOUT.names[:16], LAYOUT.positions[:16])
     assert len(visible_markers(one_plane, CAMERA)) == 16
+
+
+@pytest.mark.parametrize("name", ["fishtail-crude", "fishtail-fine"])
+@pytest.mark.parametrize("bend", [0.0, 0.03])
+def test_a_single_row_on_each_edge_of_a_hollow_flat_body(name: str, bend: float, random: np.random.Generator) -> None:
+    """Fish-tails: every dot of the far edge is behind one of the near edge, and the near edge is no flat side."""
+    layout = read_layout(Path(__file__).parents[2] / "datasets" / "specimens" / f"{name}.yaml")
+    near = [k for k, marker in enumerate(layout.names) if marker.startswith("L")]
+    assert visible_markers(layout, CAMERA).tolist() == near
+    places = layout.positions[near].copy()
+    places[:, 2] -= bend * (places[:, 0] / 0.1) ** 2
+    mixed = random.permutation(len(near))
+    assert name_by_layout(CAMERA.project(places)[mixed], layout, CAMERA, "a video") == mixed.tolist()
 
 
 @pytest.mark.parametrize(
