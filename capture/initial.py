@@ -22,7 +22,7 @@ SURFACE_SIGMA = 0.3  # of every force, where forces act all over the surface
 FIRST_DAMPING, LAST_DAMPING = 1e4, 1e16  # of a step, as a multiple of the prior
 MOST_STEPS = 100
 QUICK = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
-CONVERGED, ENOUGH = 1e-4, 1e-3  # the search ends where a whole step promises less, of the objective and at all
+CONVERGED, ENOUGH = 1e-4, 1e-3  # the search ends where a step promises or brings less, of the objective and at all
 UNOBSERVED = 10.0  # times the median sigma: an axis that no camera saw
 
 
@@ -131,10 +131,13 @@ class _Search:
         self.weight = 1.0 / np.sqrt(frame.sigma[frame.seen].ravel() ** 2 + beyond**2)
 
     def state(self, force: Array, pose: Rigid, start: Array | None) -> _State:
-        frame = self.frame
-        total = (frame.simulator.weight + force)[None]
-        begin = None if start is None else start[None]
-        q = frame.simulator.equilibrium(total, begin, f"{frame.what}: first frame")[0]
+        frame, simulator = self.frame, self.frame.simulator
+        total, what = (simulator.weight + force)[None], f"{frame.what}: first frame"
+        if start is None:
+            q = simulator.equilibrium(total, what=what)[0]
+        else:  # a step too far is to fail at once, not to be led there in small ones
+            none = np.zeros(total.shape[:2])
+            q = simulator.minimise(start[None], none, start[None], total, simulator.resistance(1), what)[0]
         own = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.seen]
         gap = (own - pose.apply(frame.target[frame.seen])).ravel()
         at = force[frame.nodes].ravel()
@@ -165,6 +168,8 @@ class _Search:
             if fall <= 0.0:
                 break
             now = new
+            if fall < CONVERGED * now.objective + ENOUGH:
+                break
         return now
 
     def _normal_equations(self, now: _State) -> tuple[Array, Array]:
