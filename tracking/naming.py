@@ -38,7 +38,8 @@ def _not_behind_others(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64
     """Indices of the markers that no nearer marker covers."""
     pixels = camera.ideal(layout.positions)
     # Of a marker and its image on the far side the second nearest is a true neighbour.
-    spacing = float(np.median(cKDTree(pixels).query(pixels, min(3, len(pixels)))[0][:, -1]))
+    distances = cKDTree(pixels).query(pixels, min(3, len(pixels)))[0].reshape(len(pixels), -1)
+    spacing = float(np.median(distances[:, -1]))
     kept: list[int] = []
     for marker in np.argsort(layout.positions @ camera.viewing_direction):
         if all(np.linalg.norm(pixels[marker] - pixels[other]) > BEHIND * spacing for other in kept):
