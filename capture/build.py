@@ -18,12 +18,11 @@ from capture.sources import Recorded, find_source, read_recorded
 from capture.specimen import Specimen
 from capture.table import RecordingRow
 from groundwork import InputError
-from rafl.dataset import Dataset, Trajectory
+from rafl.dataset import UNEVEN, Dataset, Trajectory
 from rafl.synthetic import load_force
 
 Array = NDArray[Any]
 
-SAME_STEP = 5e-3  # largest relative difference of time steps within a dataset
 WINDOW = 2  # frames on each side from which the velocity in the first frame is taken, by a polynomial through all
 
 
@@ -90,14 +89,19 @@ def build_dataset(
         registration = register(item, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
         trajectories[row.recording] = _trajectory(empty, specimen, item, row, registration, settings)
         tick()
-    return Dataset(specimen.name, simulator, markers, trajectories, recipe)
+    dataset = Dataset(specimen.name, simulator, markers, trajectories, recipe)
+    try:
+        dataset.check()
+    except ValueError as error:
+        raise InputError(f"a dataset of {folder} would not be sound: {error}; correct the recording") from None
+    return dataset
 
 
 def _common_step(recorded: dict[str, Recorded]) -> float:
     steps = {name: float(np.median(np.diff(item.time))) for name, item in recorded.items()}
     first, step = next(iter(steps.items()))
     for name, other in steps.items():
-        if abs(other / step - 1.0) > SAME_STEP:
+        if abs(other / step - 1.0) > UNEVEN:
             raise InputError(
                 f"recording {name}: expected {1 / step:.2f} frames/s as in {first}, found {1 / other:.2f}; put "
                 "recordings of different rates into different datasets"

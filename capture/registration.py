@@ -13,6 +13,7 @@ from groundwork import InputError
 
 Array = NDArray[Any]
 
+UNKNOWN_SIGMA = 1.0  # [m], of a coordinate that was not observed
 STRAY = 0.3  # of a marker's distance from the clamp, in units of the farthest one's: how far it may be bent away
 
 
@@ -82,6 +83,7 @@ def mean_position(position: Array, sigma: Array) -> tuple[Array, Array]:
 
     Only what scatters from frame to frame is averaged out; the rest of sigma stays.
     """
+    sigma = np.where(np.isfinite(sigma), sigma, UNKNOWN_SIGMA)
     seen = np.isfinite(position[..., :1])
     weight = np.where(seen, 1.0 / np.where(seen, sigma, 1.0) ** 2, 0.0)
     total, count = weight.sum(axis=0), seen.sum(axis=0)
@@ -130,14 +132,14 @@ def register(
     """
     skin, names = len(specimen.layout.names), every_place(specimen)[0]
     clamp = specimen.clamp_layout.positions if rest is None else rest.clamp
-    known = np.isfinite(clamp[:, 0])
+    known = np.isfinite(clamp[:, 0]) & np.isfinite(item.position[:, skin:, 0]).any(axis=0)
     on_clamp, sigma = item.position[:, skin:][:, known], item.sigma[:, skin:][:, known]
     if (np.isfinite(on_clamp[..., 0]).sum(axis=1) >= FEWEST_MARKERS).any():
         if not moving_clamp:
             on_clamp, sigma = (part[None] for part in mean_position(on_clamp, sigma))
         pose, away = follow_clamp(on_clamp, clamp[known], sigma)
         by_marker = np.sqrt(np.nanmean(away**2, axis=0))
-        worst = float(np.nanmax(by_marker))
+        worst = float(by_marker.max())
         if worst > tolerance:
             raise InputError(
                 f"recording {name}: expected the clamp markers where the specimen has them, found them "

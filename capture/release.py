@@ -74,11 +74,15 @@ def _rest_before(position: Array, start: int, change: Array) -> int:
     if not np.isfinite(quiet).any():
         return start
     noise = float(np.nanmedian(quiet)) / np.sqrt(6.0)
-    place = np.nanmean(position[max(start - 3, 0) : start], axis=0)
+    latest = position[max(start - 3, 0) : start]
+    seen = np.isfinite(latest)
+    with np.errstate(invalid="ignore"):
+        place = np.where(seen, latest, 0.0).sum(axis=0) / seen.sum(axis=0)  # NaN where never seen
     first = start
     for frame in range(start - 1, max(start - LONGEST, 0) - 1, -1):
         away = np.linalg.norm(position[frame] - place, axis=1)
-        if np.isfinite(away).any() and np.sqrt(np.nanmean(away**2)) > STILL * noise:
+        away = away[np.isfinite(away)]
+        if len(away) and np.sqrt((away**2).mean()) > STILL * noise:
             break
         first = frame
     return first

@@ -14,7 +14,7 @@ from rafl.simulator import Simulator
 Array = NDArray[Any]
 
 SPLITS = ("train", "val", "test")
-UNEVEN = 5e-3  # of the time step: how far times may be from their grid
+UNEVEN = 5e-3  # of the time step: how far times may be from their grid, and time steps from another
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 import datetime
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundwork import VERSION, InputError, check_format, require_file, whole_file
-from rafl.dataset import Dataset, Trajectory
+from rafl.dataset import UNEVEN, Dataset, Trajectory
 from rafl.markers import Markers
 from rafl.material import Material
 from rafl.mesh import HexMesh
@@ -59,8 +60,21 @@ def update_dataset(path: Path, dataset: Dataset) -> None:
         InputError: no dataset there, or one of another specimen.
         ValueError: parts that do not fit together.
     """
-    dataset.check()
     earlier = read_dataset(path)
+    own, other = earlier.simulator, dataset.simulator
+    if abs(other.time_step / own.time_step - 1.0) > UNEVEN:
+        raise InputError(
+            f"expected recordings of {1 / own.time_step:.2f} frames/s as in {path}, found {1 / other.time_step:.2f}; "
+            "put them into another dataset"
+        )
+    for key in ("gravity", "integrator", "substeps"):
+        if getattr(own, key) != getattr(other, key):
+            raise InputError(
+                f"expected {key} {getattr(own, key)} as in {path}, found {getattr(other, key)}; build it whole, "
+                "without --update"
+            )
+    dataset = replace(dataset, simulator=replace(other, time_step=own.time_step))
+    dataset.check()
     with whole_file(path) as temporary, h5py.File(temporary, "w") as file, h5py.File(path, "r") as old:
         _write(file, dataset, f"{earlier.recipe}\n# then\n{dataset.recipe}")
         for part in SPECIMEN:
@@ -69,11 +83,6 @@ def update_dataset(path: Path, dataset: Dataset) -> None:
                     f"expected a dataset of the same specimen in {path}, found another {part}; build it whole, "
                     "without --update"
                 )
-        if earlier.simulator.time_step != dataset.simulator.time_step:
-            raise InputError(
-                f"expected recordings of {1 / earlier.simulator.time_step:.2f} frames/s as in {path}, found "
-                f"{1 / dataset.simulator.time_step:.2f}; put them into another dataset"
-            )
         for name in earlier.trajectories:
             if name not in dataset.trajectories:
                 old.copy(f"trajectories/{name}", file["trajectories"], name)

@@ -89,8 +89,8 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
     best = min(first, key=lambda result: result.fun)
     last = search.descend(best.x, max(settings.epochs - ROUNDS, 0))
     model = search.model(last.x)
-    write_text(run / "parameters.csv", search.certainty(last.x))
     save_model(run, model)
+    write_text(run / "parameters.csv", search.certainty(last.x))
     return model
 
 
@@ -136,14 +136,14 @@ class _Search:
     def __call__(self, x: Array) -> tuple[float, Array]:
         """Loss and its gradient; a high wall where a simulation fails, so that the line search comes back."""
         try:
-            loss, slope = self._known(x)
+            loss, slope = self._asked(x)
         except SimulationError:
             if not self.known:
                 raise
             return WALL, np.zeros(len(x))
         return loss, np.array(slope)
 
-    def _known(self, x: Array) -> tuple[float, list[float]]:
+    def _asked(self, x: Array) -> tuple[float, list[float]]:
         """Loss and its gradient, simulated where they are not known yet."""
         key = tuple(float(value) for value in x)
         if key not in self.known:
@@ -193,20 +193,13 @@ class _Search:
         """As CSV: each value with its 95 % interval, and how they trade off against one another.
 
         Markers' errors are taken as independent, of the size of what the fit leaves; the curvature of the loss then
-        is the information. A number at its bound has no interval.
-
-        Raises:
-            SimulationError: the material beside the best one cannot be simulated.
+        is the information. A number at its bound has no interval; none has one where a material beside the best
+        cannot be simulated.
         """
         inside = [k for k, q in enumerate(self.quantities) if q.bounds[0] + STEP < x[k] < q.bounds[1] - STEP]
         covariance = np.full((len(x), len(x)), np.nan)
-        if inside:
-            columns = []
-            for k in inside:
-                h = STEP * np.eye(len(x))[k]
-                ahead, behind = (np.array(self._known(place)[1]) for place in (x + h, x - h))
-                columns.append((ahead - behind)[inside] / (2.0 * STEP))
-            curvature = 0.5 * (np.array(columns) + np.array(columns).T)
+        curvature = self._curvature(x, inside)
+        if curvature is not None:
             seen = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.train)
             own = 2.0 * self(x)[0] / max(seen - len(x), 1.0) * np.linalg.pinv(curvature)
             covariance[np.ix_(inside, inside)] = own
@@ -221,6 +214,18 @@ class _Search:
             lines.append(f"{q.name},{q.unit}," + ",".join("" if np.isnan(cell) else f"{cell:.6g}" for cell in cells))
         return "\n".join(lines) + "\n"
 
+    def _curvature(self, x: Array, chosen: list[int]) -> Array | None:
+        """Second derivatives of the loss by the chosen variables; None of none, or where a simulation fails."""
+        columns = []
+        for k in chosen:
+            h = STEP * np.eye(len(x))[k]
+            try:
+                ahead, behind = (np.array(self._asked(place)[1]) for place in (x + h, x - h))
+            except SimulationError:
+                return None
+            columns.append((ahead - behind)[chosen] / (2.0 * STEP))
+        return 0.5 * (np.array(columns) + np.array(columns).T) if columns else None
+
 
 def spoken(table: pd.DataFrame) -> list[str]:
     """What `parameters.csv`, read as a data frame, says, in sentences."""
@@ -228,7 +233,11 @@ def spoken(table: pd.DataFrame) -> list[str]:
     for row in table.to_dict("records"):
         unit = f" {row['unit']}" if isinstance(row["unit"], str) else ""
         interval = f"95 % interval {row['low_95']:.5g} to {row['high_95']:.5g}"
-        interval = interval if np.isfinite(row["low_95"]) else "at its bound: no interval"
+        interval = (
+            interval
+            if np.isfinite(row["low_95"])
+            else "no interval: at its bound, or a material beside it cannot be simulated"
+        )
         lines.append(f"{row['name']} = {row['value']:.5g}{unit} ({interval})")
     for a, b in itertools.combinations(range(len(table)), 2):
         c = float(table[f"correlation_{table['name'][b]}"][a])

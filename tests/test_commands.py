@@ -159,17 +159,21 @@ def authors_arrays(specimen: Specimen, folder: Path) -> Path:
     return folder
 
 
-def test_capture_refuses(small_specimen: Specimen, specimen_file: Path, run: Run, tmp_path: Path) -> None:
+@pytest.fixture
+def capture_line(small_specimen: Specimen, specimen_file: Path, tmp_path: Path) -> tuple[str | Path, ...]:
+    """The command that builds a.h5 from the authors' arrays and the table of one recording beside it."""
     authors_arrays(small_specimen, tmp_path)
+    table = tmp_path / "recordings.csv"
+    table.write_text("recording,load_g,split\nq0,50,train\n")
+    return ("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
+
+
+def test_capture_refuses(capture_line: tuple[str | Path, ...], specimen_file: Path, run: Run, tmp_path: Path) -> None:
     table = tmp_path / "recordings.csv"
     table.write_text("recording,load_g,split\nq0,50,train\nq1,70,test\n")
 
-    def capture(*more: str) -> object:
-        return run("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5", *more)
-
     def refused(*parts: str) -> None:
-        result = run("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
-        assert_refused(result, *parts)
+        assert_refused(run(*capture_line), *parts)
         assert not list(tmp_path.glob("*a*.h5"))
 
     text = specimen_file.read_text()
@@ -187,29 +191,22 @@ def test_capture_refuses(small_specimen: Specimen, specimen_file: Path, run: Run
 
 
 def test_a_failed_capture_leaves_the_old_dataset(
-    small_specimen: Specimen, specimen_file: Path, run: Run, tmp_path: Path
+    capture_line: tuple[str | Path, ...], run: Run, tmp_path: Path
 ) -> None:
-    authors_arrays(small_specimen, tmp_path)
-    table = tmp_path / "recordings.csv"
-    table.write_text("recording,load_g,split\nq0,50,train\n")
-    line = ("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
-    assert run(*line).returncode == 0
+    assert run(*capture_line).returncode == 0
     assert "data:image/png" in (tmp_path / "a.html").read_text()
     before = (tmp_path / "a.h5").read_bytes()
     (tmp_path / "q0.npy").write_bytes(b"broken")
-    assert_refused(run(*line), "q0.npy", "cannot be read")
+    assert_refused(run(*capture_line), "q0.npy", "cannot be read")
     assert (tmp_path / "a.h5").read_bytes() == before
 
 
 def test_a_dataset_is_looked_at_verified_and_added_to(
-    small_specimen: Specimen, specimen_file: Path, run: Run, tmp_path: Path
+    capture_line: tuple[str | Path, ...], specimen_file: Path, run: Run, tmp_path: Path
 ) -> None:
-    authors_arrays(small_specimen, tmp_path)
-    table = tmp_path / "recordings.csv"
-    table.write_text("recording,load_g,split\nq0,50,train\n")
-    line = ("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
+    line = capture_line
     assert run(*line).returncode == 0
-    table.write_text("recording,load_g,split\nq1,70,test\n")
+    (tmp_path / "recordings.csv").write_text("recording,load_g,split\nq1,70,test\n")
     assert_refused(run(*line), "split `train`")
     assert run(*line, "--update").returncode == 0
     said = run("rafl-capture", "--inspect", "a.h5")

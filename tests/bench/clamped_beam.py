@@ -7,19 +7,14 @@ Resumable: what stands under --out is not computed again.
 """
 
 import argparse
-import subprocess
-import sys
 from pathlib import Path
 
 import pandas as pd
+from commands import command
 
 SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
 METHODS = {"sysid": 25, "sysid-e": 15, "sysid-damping": 30, "rafl": 25}  # epochs
 COLUMNS = ["original", "original (paper preset)", *METHODS]
-
-
-def command(name: str, *arguments: object) -> None:
-    subprocess.run([str(Path(sys.executable).parent / name), *map(str, arguments)], check=True)
 
 
 def dataset_of(specimen: Path, recordings: Path, out: Path, name: str) -> Path:

@@ -7,10 +7,7 @@ stands under --out is not made again. --quick takes three shapes, fewer recordin
 """
 
 import argparse
-import os
 import shutil
-import subprocess
-import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ import numpy as np
 import pandas as pd
 import torch
 import yaml
+from commands import command
 from rich.console import Console
 from rich.table import Table
 
@@ -62,11 +60,6 @@ FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl":
 QUICK = Effort(
     ("canonical", "thicker-scaled", "shorter"), (3, 1, 2), 50, {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8}
 )
-
-
-def command(name: str, *arguments: object) -> None:
-    line = [str(Path(sys.executable).parent / name), *map(str, arguments)]
-    subprocess.run(line, check=True, stdout=subprocess.DEVNULL, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})
 
 
 class Study:

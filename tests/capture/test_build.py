@@ -68,21 +68,26 @@ def test_the_authors_arrays_are_registered_by_their_rest_row(
 
 
 def with_clamp(specimen: Specimen) -> Specimen:
-    places = np.array([[-0.01, -0.02, 0.0], [-0.01, 0.04, 0.0], [-0.01, 0.01, 0.05]])
-    return replace(specimen, clamp_layout=MarkerLayout(("C1", "C2", "C3"), places))
+    places = np.array([[-0.01, -0.02, 0.0], [-0.01, 0.04, 0.0], [-0.01, 0.01, 0.05], [-0.02, 0.0, 0.0]])
+    return replace(specimen, clamp_layout=MarkerLayout(("C1", "C2", "C3", "C4"), places))
 
 
 def test_motion_capture_in_the_frame_of_a_moving_clamp(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
-    """The clamp shakes by a millimetre and a degree; in its frame the markers move as if it did not."""
+    """The clamp shakes by a millimetre and a degree; in its frame the markers move as if it did not.
+
+    One of its markers is never seen."""
     specimen = with_clamp(small_specimen)
     random = np.random.default_rng(5)
-    points = np.concatenate([truth[1:], np.broadcast_to(specimen.clamp_layout.positions, (FRAMES, 3, 3))], axis=1)
+    points = np.concatenate([truth[1:], np.broadcast_to(specimen.clamp_layout.positions, (FRAMES, 4, 3))], axis=1)
     turns = Rotation.from_rotvec(random.normal(0, np.radians(1), (FRAMES, 3))).as_matrix()
     shaken = np.einsum("tij,tmj->tmi", turns, points) + random.normal(0, 1e-3, (FRAMES, 1, 3))
+    shaken[:, -1] = np.nan
     write_c3d(tmp_path / "q0.c3d", [*specimen.layout.names, *specimen.clamp_layout.names], in_the_lab(shaken))
     item = build(specimen, tmp_path).trajectories["q0"]
+    assert [text.split()[0] for text in str(item.attributes["registration_markers"]).split(", ")] == ["C1", "C2", "C3"]
+    assert item.attributes["registration_residual_mm"] < 1e-3
     np.testing.assert_allclose(item.markers, truth[1:], atol=1e-6)  # C3D holds single precision
     still = build(specimen, tmp_path, replace(SETTINGS, moving_clamp=False)).trajectories["q0"]
     assert np.abs(still.markers - truth[1:]).max() > 5e-4
@@ -164,26 +169,24 @@ def test_a_recording_that_starts_in_motion(small_specimen: Specimen, tmp_path: P
     assert np.abs(at_rest.v).max() == 0.0
 
 
+def track(specimen: Specimen, folder: Path, position: np.ndarray, sigma: np.ndarray) -> None:
+    """Write q0.h5, every marker seen."""
+    time, state = 0.01 * np.arange(FRAMES), np.ones(position.shape[:2], dtype=np.uint8)
+    tracks = Tracks(
+        specimen.layout.names, time, position, sigma, state, {}, {}, {}, {}, {}, {}, 100.0, "", {"v.mp4": "0"}, "",
+    )  # fmt: skip
+    write_tracks(folder / "q0.h5", tracks)
+
+
 def test_tracks_are_taken_as_they_are_unless_they_cannot_be(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
     """The calibration's world is the specimen's frame; 20 mm off, no bending explains the markers."""
-    moving = truth[1:]
-    whole = np.ones(moving.shape[:2])
-
-    def write(position: np.ndarray) -> None:
-        time, sigma = 0.01 * np.arange(FRAMES), np.full_like(position, 1e-5)
-        state = whole.astype(np.uint8)
-        tracks = Tracks(
-            small_specimen.layout.names, time, position, sigma, state,
-            {}, {}, {}, {}, {}, {}, 100.0, "", {"v.mp4": "0"}, "",
-        )  # fmt: skip
-        write_tracks(tmp_path / "q0.h5", tracks)
-
-    write(moving)
+    moving, sigma = truth[1:], np.full_like(truth[1:], 1e-5)
+    track(small_specimen, tmp_path, moving, sigma)
     item = build(small_specimen, tmp_path).trajectories["q0"]
     np.testing.assert_array_equal(item.markers, moving)
-    write(moving + np.array([0.0, 0.02, 0.0]))
+    track(small_specimen, tmp_path, moving + np.array([0.0, 0.02, 0.0]), sigma)
     with pytest.raises(InputError, match="world is the specimen's frame"):
         build(small_specimen, tmp_path)
 
@@ -256,3 +259,11 @@ def test_spreadsheet_habits_are_read(tmp_path: Path) -> None:
     path.write_bytes(b"\xef\xbb\xbfrecording, load_g, split, first_frame\r\na, 50, train,\r\nb, 60, test, 3\r\n")
     rows = read_recording_rows(path)
     assert [(row.recording, row.load_g, row.first_frame) for row in rows] == [("a", 50, None), ("b", 60, 3)]
+
+
+def test_a_sigma_of_zero_is_refused_in_words(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    sigma = np.full_like(truth[1:], 1e-5)
+    sigma[4, 2] = 0.0
+    track(small_specimen, tmp_path, truth[1:], sigma)
+    with pytest.raises(InputError, match=r"trajectories/q0/sigma: expected more than 0"):
+        build(small_specimen, tmp_path)

@@ -89,7 +89,8 @@ def test_one_recording_is_replaced_or_added_and_the_others_stay(dataset: Dataset
     assert read_dataset(path).recipe == "by a test\n# then\nmore"
     assert damaged_parts(path) == []
     other = replace(dataset, simulator=replace(dataset.simulator, mesh=dataset.simulator.mesh.scaled((1.1, 1, 1))))
-    for wrong, message in ((other, "another mesh"), (replace(dataset, simulator=slower(dataset)), "frames/s")):
+    twice = replace(dataset, simulator=replace(dataset.simulator, substeps=2))
+    for wrong, message in ((other, "another mesh"), (at_step(dataset, 0.0102), "frames/s"), (twice, "substeps 1")):
         with pytest.raises(InputError, match=message):
             update_dataset(path, wrong)
     assert content(path, "a") == before["a"]
@@ -97,8 +98,17 @@ def test_one_recording_is_replaced_or_added_and_the_others_stay(dataset: Dataset
         update_dataset(tmp_path / "none.h5", dataset)
 
 
-def slower(dataset: Dataset):  # type: ignore[no-untyped-def]
-    return replace(dataset.simulator, time_step=0.01004)
+def at_step(dataset: Dataset, step: float) -> Dataset:
+    return replace(dataset, simulator=replace(dataset.simulator, time_step=step))
+
+
+def test_recordings_of_nearly_the_same_rate_are_added(dataset: Dataset, tmp_path: Path) -> None:
+    """The file's own time step stays."""
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    update_dataset(path, replace(at_step(dataset, 0.01002), trajectories={"e": dataset.trajectories["a"]}))
+    assert read_dataset(path).simulator.time_step == dataset.simulator.time_step
+    assert "e" in read_dataset(path).trajectories
 
 
 def test_changed_numbers_and_words_are_found(dataset: Dataset, tmp_path: Path) -> None:

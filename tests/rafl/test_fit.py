@@ -9,6 +9,7 @@ import torch
 from groundwork import InputError
 from rafl import fit
 from rafl.dataset import Dataset
+from rafl.errors import SimulationError
 from rafl.fit import fit_residual_field, mean_error, training_items
 from rafl.mesh import HexMesh
 from rafl.objective import Recordings
@@ -116,6 +117,24 @@ def test_the_stated_uncertainty_is_the_actual_one(dataset: Dataset, tmp_path: Pa
         found.append(model.material["youngs_modulus"])
         widths.append((table["high_95"][0] - table["low_95"][0]) / 2 / 1.96)
     assert np.std(found, ddof=1) == pytest.approx(np.mean(widths), rel=0.5)  # of 16 copies, it varies by 18 %
+
+
+def test_a_fit_beside_what_cannot_be_simulated_is_kept(
+    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without an interval."""
+    settings = replace(SETTINGS, method="sysid-e", epochs=3, frames=4)
+    simulated = _Search._simulate
+
+    def simulate(self: _Search, x: np.ndarray) -> tuple[float, list[float]]:
+        if (tmp_path / "model.pt").exists():
+            raise SimulationError("too stiff")
+        return simulated(self, x)
+
+    monkeypatch.setattr(_Search, "_simulate", simulate)
+    model = identify_material([dataset], settings, tmp_path, silent)
+    assert load_model(tmp_path).material == model.material
+    assert "no interval" in spoken(pd.read_csv(tmp_path / "parameters.csv"))[0]
 
 
 def test_trading_off_is_said() -> None:
