@@ -21,6 +21,7 @@ LEAST_CONTRAST = 12.0  # grey levels
 LEAST_SIGMA = 1e-3  # px: below it the model's own error counts
 SHARED_NOISE = 1.25  # variance by blocks over that by independent errors, beyond which errors are shared
 ENOUGH_FOR_TWO = 12  # dots, to fit half of them in another thread
+SAME_PLACE = 0.6  # radii: two dots closer than this are one
 SPOT_SHARE = 0.3  # of the markers' contrast: what a spot must stand out by
 
 
@@ -186,6 +187,16 @@ def find_dots(image: NDArray, dark: bool) -> Dots:
     good &= (np.abs(dots.contrast) > LEAST_CONTRAST) & ((dots.contrast < 0) == dark)
     good &= (dots.centre > 0).all(axis=1) & (dots.centre < np.array(image.shape[::-1]) - 1).all(axis=1)
     return dots[good]
+
+
+def apart(dots: Dots, nearest: float) -> Dots:
+    """Of dots fitted twice, the better located."""
+    order = np.argsort(dots.sigma.max(axis=1))
+    kept: list[int] = []
+    for row in order:
+        if all(np.hypot(*(dots.centre[row] - dots.centre[other])) > nearest for other in kept):
+            kept.append(int(row))
+    return dots[np.array(kept, dtype=int)]
 
 
 def find_spots(image: NDArray, radius: float, contrast: float, region: tuple[int, int, int, int]) -> Array:

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from groundwork import InputError
 from tracking.disc import PARAMETERS
-from tracking.dots import Dots, eight_bits, find_spots, fit_dots, start_of
+from tracking.dots import SAME_PLACE, Dots, apart, eight_bits, find_spots, fit_dots, start_of
 from tracking.family import Family, find_family
+from tracking.newcomers import Newcomer, Newcomers
 from tracking.noise import with_shared_errors
-from tracking.shape import Pattern, recognise
+from tracking.shape import Pattern, carry, recognise
 from tracking.video import Video
 
 Array = NDArray[Any]
@@ -27,7 +28,7 @@ SEED_REACH = 2.2  # spacings: how far from where it is expected a marker may be
 ORDERS = 4  # of prediction
 FADING = 0.85  # of what was learned of the oscillation, each frame
 RECHECK = 4  # frames between searches for markers out of sight
-SAME_PLACE = 0.6  # radii: two dots closer than this are one
+NOTHING = np.empty((0, 2))
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,8 @@ class PixelTracks:
         time: [s], (T), NaN where the video does not say.
         pixel: (T, D, 2), NaN where not measured.
         sigma: one standard deviation along x and y [px], (T, D, 2).
-        start: positions in the first frame [px], (D, 2).
+        start: positions in the first frame that shows markers [px], (D, 2); of late ones where the others carry them.
+        late: how many markers, the last ones, came into sight later.
         damaged: frames that could not be decoded, (T).
         pictures: the first frame and the worst ten, by number, as JPEG.
         notes: what the video said that contradicts itself.
@@ -48,13 +50,14 @@ class PixelTracks:
     pixel: Array
     sigma: Array
     start: Array
+    late: int
     damaged: NDArray[np.bool_]
     pictures: dict[int, bytes]
     notes: tuple[str, ...]
 
 
 def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
-    """Find the markers in the first frame and follow them to the last.
+    """Find the markers in the first frame that shows some and follow them, and those that come later, to the last.
 
     Args:
         video: one camera's.
@@ -64,48 +67,55 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
         InputError: fewer than three markers, or a video that cannot be decoded.
     """
     times: list[float] = []
-    pixels: list[Array | None] = []
-    sigmas: list[Array | None] = []
+    seen: list[tuple[Array, Array]] = []  # pixels and sigma, of as many markers as were known then
+    late: list[Newcomer] = []
+    damaged: list[bool] = []
+    most = 0
     tracker: Tracker | None = None
     album = _Album()
     reading = video.read()
     for frame in reading:
         times.append(frame.time)
-        pixel = sigma = None
-        if frame.picture is not None:
-            if tracker is None:
-                found = find_family(frame.picture)
-                count = 0 if found is None else len(found[1])
-                if found is None or count < FEWEST_MARKERS:
-                    raise InputError(
-                        f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in frame "
-                        f"{len(times) - 1}, the first, found {count}; check that dots of 3 to 32 px radius "
-                        "contrast with the skin"
-                    )
+        damaged.append(frame.picture is None)
+        pair = NOTHING, NOTHING
+        if frame.picture is not None and tracker is None:
+            found = find_family(frame.picture)
+            most = max(most, 0 if found is None else len(found[1]))
+            if found is not None and len(found[1]) >= FEWEST_MARKERS:
                 tracker = Tracker(*found)
-                pixel, sigma = found[1].centre, found[1].sigma
-            else:
-                pixel, sigma = tracker.advance(frame.picture)
-            album.consider(len(times) - 1, frame.picture, sigma)
+                pair = found[1].centre, found[1].sigma
+        elif frame.picture is not None and tracker is not None:
+            pair = tracker.advance(frame.picture)
+            late += tracker.look_out(len(times) - 1, frame.picture)
         elif tracker is not None:
             tracker.pass_over()
-        pixels.append(pixel)
-        sigmas.append(sigma)
+        if frame.picture is not None and tracker is not None:
+            album.consider(len(times) - 1, frame.picture, pair[1])
+        seen.append(pair)
         tick()
-    if tracker is None:
+    if all(damaged):
         raise InputError(f"expected frames in {video.path}, found none that decode; copy it again from the camera")
-    nothing = np.full_like(tracker.pattern.rest, np.nan)
-    paths = np.array([nothing if pixel is None else pixel for pixel in pixels])
-    fitted = np.array([nothing if sigma is None else sigma for sigma in sigmas])
+    if tracker is None:
+        raise InputError(
+            f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in a frame, found {most} at most; "
+            "check that dots of 3 to 32 px radius contrast with the skin"
+        )
+    paths, fitted = _whole(seen, late, len(tracker.pattern.rest))
     return PixelTracks(
-        np.array(times),
-        paths,
-        with_shared_errors(paths, fitted),
-        tracker.pattern.rest,
-        np.array([pixel is None for pixel in pixels]),
-        album.pictures(),
-        tuple(reading.notes),
-    )
+        np.array(times), paths, with_shared_errors(paths, fitted), tracker.pattern.rest, len(late), np.array(damaged),
+        album.pictures(), tuple(reading.notes),
+    )  # fmt: skip
+
+
+def _whole(seen: list[tuple[Array, Array]], late: list[Newcomer], count: int) -> tuple[Array, Array]:
+    """Pixels and sigma (T, D, 2) of all markers, NaN where not seen; the last are the late ones."""
+    paths, fitted = np.full((2, len(seen), count, 2), np.nan)
+    for frame, (pixel, sigma) in enumerate(seen):
+        paths[frame, : len(pixel)], fitted[frame, : len(pixel)] = pixel, sigma
+    for column, newcomer in enumerate(late, start=count - len(late)):
+        for frame, (pixel, sigma) in newcomer.seen.items():
+            paths[frame, column], fitted[frame, column] = pixel, sigma
+    return paths, fitted
 
 
 class _Album:
@@ -149,6 +159,7 @@ class Tracker:
         self.surprise = np.full(ORDERS, np.inf)  # of predictions of each order [spacings]
         self.swing = np.zeros(2)  # sums from which the oscillation's stiffness follows
         self.searched = 0  # frames since the last search
+        self.newcomers = Newcomers(family)
 
     def advance(self, image: NDArray) -> tuple[Array, Array]:
         """Positions and sigma (D, 2) in the next picture, NaN where a marker is not seen."""
@@ -170,6 +181,21 @@ class Tracker:
         """A frame that shows nothing."""
         self._remember(self._expected())
         self.missing += 1
+
+    def look_out(self, number: int, image: NDArray) -> list[Newcomer]:
+        """After `advance`: markers that have become known, followed from now on."""
+        place, seen = self.believed[-1], self.missing == 0
+        found = self.newcomers.look(number, image, place, seen, self.pattern, self.parameters)
+        for newcomer in found:
+            rest = self.pattern.rest
+            carried = [carry(rest, place, newcomer.rest[None]) for place in self.believed]
+            self.believed = [np.concatenate(pair) for pair in zip(self.believed, carried, strict=True)]
+            self.pattern = Pattern.of(np.concatenate([rest, newcomer.rest[None]]))
+            self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
+            self.missing = np.append(self.missing, 0 if number in newcomer.seen else 1)
+            if number in newcomer.seen:
+                self.believed[-1][-1] = newcomer.seen[number][0]
+        return found
 
     def _patience(self) -> float:
         return RECHECK if (self.missing > 0).any() else np.inf
@@ -236,7 +262,7 @@ class Tracker:
         )
         starts = [start_of(x, y, shape, self.family.contrast, level) for x, y in spots]
         dots = fit_dots(image, np.array(starts).reshape(-1, PARAMETERS))
-        dots = _apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
+        dots = apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
         speed = np.linalg.norm(expected - self.believed[-1], axis=1) / self.pattern.spacing
         trusted = -speed - 0.2 * np.minimum(self.missing, 10)
         surprise = float(self.surprise.min())
@@ -277,13 +303,3 @@ class Tracker:
 def _only(dots: Dots, good: NDArray[np.bool_]) -> Dots:
     """The same dots, the others' sigma NaN."""
     return replace(dots, sigma=np.where(good[:, None], dots.sigma, np.nan))
-
-
-def _apart(dots: Dots, nearest: float) -> Dots:
-    """Of dots fitted twice, the better located."""
-    order = np.argsort(dots.sigma.max(axis=1))
-    kept: list[int] = []
-    for row in order:
-        if all(np.hypot(*(dots.centre[row] - dots.centre[other])) > nearest for other in kept):
-            kept.append(int(row))
-    return dots[np.array(kept, dtype=int)]

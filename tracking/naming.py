@@ -145,13 +145,18 @@ def _carried(
     return target_mean + affine @ (expected[marker] - source_mean)
 
 
-def name_by_rows(dots: Array) -> list[str]:
+def name_by_rows(dots: Array, late: int = 0) -> list[str]:
     """Names r1c1, r1c2, ... by row from the top and column from the left.
 
     Rows may be bent: each dot's neighbours say where the next of its row and column should be. Dots that
-    stand in no such grid are ordered by their height, then from the left.
+    stand in no such grid are ordered by their height, then from the left. The last `late` dots came into sight after
+    the others: where they stand in no grid with them, they are a row of their own, after the others'.
     """
     places = _grid_places(dots)
+    if places is None and late:
+        names = name_by_rows(dots[:-late])
+        last = max(int(name[1:].split("c")[0]) for name in names)
+        return names + [f"r{last + 1}c{column + 1}" for column in range(late)]
     if places is None:
         spacing = float(np.median(cKDTree(dots).query(dots, 2)[0][:, 1]))
         order = np.argsort(dots[:, 1])

@@ -145,7 +145,7 @@ def _names(item: PixelTracks, video: Video, rig: Rig, camera: str, layout: Marke
         chosen = name_by_layout(item.start, layout, rig.cameras[camera], str(video.path))
         return [layout.names[index] if index >= 0 else None for index in chosen]
     prefix = f"{camera}-" if len(rig.cameras) > 1 else ""
-    return [prefix + name for name in name_by_rows(item.start)]
+    return [prefix + name for name in name_by_rows(item.start, item.late)]
 
 
 def _all_names(names: dict[str, list[str | None]], layout: MarkerLayout | None) -> list[str]:

@@ -52,24 +52,28 @@ class Pattern:
     def carried(self, position: Array, known: NDArray[np.bool_]) -> Array:
         """Where the unknown markers are, by the affine map of the nearest known ones from rest, (M, 2)."""
         result = position.copy()
-        sources = np.flatnonzero(known)
-        unknown = np.flatnonzero(~known)
-        if not len(sources) or not len(unknown):
-            return result
-        count = min(6, len(sources))
-        nearest = cKDTree(self.rest[sources]).query(self.rest[unknown], count)[1].reshape(len(unknown), count)
-        # Known markers in one line say nothing across it but that the body turns with them.
-        even = np.ones(len(sources))
-        turned = _similarity(self.rest[sources], position[sources], even)
-        matrix = _affine(self.rest[sources], position[sources], even, turned)
-        for marker, rows in zip(unknown, nearest, strict=True):
-            around = sources[rows]
-            weight = 1.0 / np.linalg.norm(self.rest[around] - self.rest[marker], axis=1)
-            local = _affine(self.rest[around], position[around], weight, matrix)
-            share = weight / weight.sum()
-            offset = self.rest[marker] - share @ self.rest[around]
-            result[marker] = share @ position[around] + local @ offset
+        if known.any():
+            result[~known] = carry(self.rest[known], position[known], self.rest[~known])
         return result
+
+
+def carry(source: Array, target: Array, points: Array) -> Array:
+    """Where points (P, 2) go by the affine map of the nearest of `source`, which go to `target` (N, 2)."""
+    result = np.empty_like(points)
+    if not len(points):
+        return result
+    count = min(6, len(source))
+    nearest = cKDTree(source).query(points, count)[1].reshape(len(points), count)
+    # Known markers in one line say nothing across it but that the body turns with them.
+    even = np.ones(len(source))
+    matrix = _affine(source, target, even, _similarity(source, target, even))
+    for number, around in enumerate(nearest):
+        weight = 1.0 / (np.linalg.norm(source[around] - points[number], axis=1) + 1e-9)
+        local = _affine(source[around], target[around], weight, matrix)
+        share = weight / weight.sum()
+        offset = points[number] - share @ source[around]
+        result[number] = share @ target[around] + local @ offset
+    return result
 
 
 def _similarity(source: Array, target: Array, weight: Array) -> Array:

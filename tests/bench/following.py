@@ -58,8 +58,9 @@ def judge(drawn: Drawn) -> Judged:
     tracks = follow(drawn, lambda: None)  # type: ignore[arg-type]
     truth, spacing = drawn.beam.centres, drawn.beam.spacing
     hidden = np.zeros(truth.shape[:2], bool) if drawn.hidden is None else drawn.hidden
-    order = np.linalg.norm(truth[0][:, None] - tracks.start[None], axis=2).argmin(axis=1)
-    away = np.linalg.norm(tracks.pixel[:, order] - truth, axis=2)
+    apart = np.linalg.norm(truth[0][:, None] - tracks.start[None], axis=2)
+    away = np.linalg.norm(tracks.pixel[:, apart.argmin(axis=1)] - truth, axis=2)
+    away[:, apart.min(axis=1) > 0.5 * spacing] = np.nan  # dots that no track begins at
     measured = np.isfinite(away)
     wrong = int((away[measured] > 0.4 * spacing).sum())
     lost = (~hidden & ~measured).sum() / (~hidden).sum()
@@ -100,6 +101,7 @@ def hiding(random: np.random.Generator, quick: bool) -> Iterator[Row]:
         ("a third hidden 100 frames", 150),
         ("all hidden 10 frames", 50),
         ("leaving and entering", 120),
+        ("a third hidden for the first 30 frames", 120),
     ):
         results = []
         for k in range(count):
@@ -112,6 +114,8 @@ def hiding(random: np.random.Generator, quick: bool) -> Iterator[Row]:
                 hidden[20:120, order[: dots // 3]] = True
             elif case.startswith("all"):
                 hidden[20:30] = True
+            elif case.endswith("first 30 frames"):
+                hidden[:30, np.argsort(beam.centres[0] @ random.normal(size=2))[: dots // 3]] = True
             else:
                 across = beam.centres[:, :, 0]
                 hidden = across > np.quantile(across, 0.7)
@@ -119,6 +123,7 @@ def hiding(random: np.random.Generator, quick: bool) -> Iterator[Row]:
             results.append(judge(Drawn(beam, random.uniform(2, 6), k, hidden)))
         yield Row("recordings with a wrong identity", case, sum(item.wrong > 0 for item in results), "0")
         yield Row("dots not back at the end", case, sum(item.late for item in results), "0")
+        yield Row("dots in sight not measured [%]", case, 100 * float(np.mean([item.lost for item in results])))
 
 
 def filling(random: np.random.Generator, quick: bool) -> Iterator[Row]:

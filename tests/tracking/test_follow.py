@@ -21,7 +21,8 @@ class Drawn:
 
     places: np.ndarray
     path: Path = Path("drawn.mp4")
-    hidden: tuple[int, ...] = ()
+    hidden: tuple[int, ...] = ()  # frames that do not show the first three dots
+    blots: tuple[tuple[float, float], ...] = ()  # that stand still, from frame 5 on
 
     def read(self) -> Reading:
         return Reading(self.frames())
@@ -29,7 +30,8 @@ class Drawn:
     def frames(self) -> Iterator[Frame]:
         for frame, places in enumerate(self.places):
             shown = places[3:] if frame in self.hidden else places
-            dots = [(x, y, 6.0, 6.0, 0.0) for x, y in shown]
+            blots = self.blots if frame >= 5 else ()
+            dots = [(x, y, 6.0, 6.0, 0.0) for x, y in (*shown, *blots) if np.isfinite(x)]
             yield Frame(0.01 * frame, picture(dots, SIZE, noise=2.0, seed=frame))
 
 
@@ -69,6 +71,38 @@ def test_hidden_dots_come_back_under_their_names() -> None:
     assert np.isnan(found[6:12, :3]).all()
     assert np.abs(found[12:] - truth[12:]).max() < 0.3
     assert np.abs(found[:, 3:] - truth[:, 3:]).max() < 0.3
+
+
+def test_dots_hidden_at_first_are_taken_in() -> None:
+    """A hand holds the specimen for fifteen frames, then it swings; the dots are known from the moment they show."""
+    rest = grid()
+    rest = np.concatenate([rest[[4, 13, 23]], np.delete(rest, [4, 13, 23], axis=0)])
+    truth = bent(rest, np.concatenate([np.zeros(15), 20.0 * np.sin(2 * np.pi * np.arange(55) / 16)]))
+    tracks = follow(Drawn(truth, hidden=tuple(range(15))), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 3
+    assert tracks.pixel.shape == truth.shape
+    match = order(tracks.start, truth[0])
+    assert sorted(match) == list(range(24))
+    found = tracks.pixel[:, match]
+    assert np.isnan(found[:15, :3]).all()
+    assert np.abs(found[15:] - truth[15:]).max() < 0.3
+
+
+@pytest.mark.parametrize("period", [10, 35, 160])
+def test_what_stands_still_behind_the_body_is_not_taken_in(period: int) -> None:
+    """Nor where the swinging body comes back to it again and again, or leaves it slowly."""
+    truth = bent(grid(), 20.0 * np.sin(2 * np.pi * np.arange(100) / period))
+    blots = ((20.0, 40.0), (160.0, 40.0), (330.0, 100.0), (330.0, 180.0), (100.0, 195.0), (220.0, 210.0))
+    tracks = follow(Drawn(truth, blots=blots), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 0
+
+
+def test_frames_before_the_first_that_shows_dots_are_missing() -> None:
+    truth = np.concatenate([np.full((4, 24, 2), np.nan), np.repeat(grid()[None], 3, axis=0)])
+    tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
+    assert np.isnan(tracks.pixel[:4]).all()
+    assert not tracks.damaged.any()
+    assert np.abs(tracks.pixel[4:, order(tracks.start, truth[4])] - truth[4:]).max() < 0.3
 
 
 def test_the_family_is_the_dots_not_the_clutter() -> None:
