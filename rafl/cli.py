@@ -56,7 +56,7 @@ def fit(
     epochs: Annotated[
         int | None, typer.Option(min=1, help="Passes over the recordings (iterations of sysid), at most [by method].")
     ] = None,
-    learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start (rafl).")] = 5e-3,
+    learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start (rafl).")] = 1e-3,
     weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's (rafl, srl).")] = 1e-5,
     patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping (rafl).")] = 20,
     frames: Annotated[int, typer.Option(min=0, help="Leading frames to train on (0: all).")] = 0,
@@ -64,8 +64,8 @@ def fit(
     batch: Annotated[int, typer.Option(min=1, help="Recordings an update (rafl); torchrun shares them out.")] = 1,
     force_penalty: Annotated[float, typer.Option(min=0.0, help="On squared residual forces [m2/N2] (rafl).")] = 1e-8,
     warm_start: Annotated[
-        int, typer.Option(min=0, help="Passes over the equations of motion first, where every vertex is seen (rafl).")
-    ] = 12,
+        int, typer.Option(min=0, help="Passes over the forces that follow the recordings step by step, first (rafl).")
+    ] = 20,
     start: Annotated[Path | None, typer.Option("--from", help="Run to fine-tune (rafl).")] = None,
     by_sigma: Annotated[
         bool, typer.Option("--by-sigma", help="Weigh markers by their uncertainty (rafl, sysid).")

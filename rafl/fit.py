@@ -117,6 +117,9 @@ def field_of(run: Path) -> ResidualField:
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
     """Train a `ResidualField` by Adam, one step per batch of recordings; the best on the validation set is kept.
 
+    Where a field makes a simulation fail, the best so far takes its place, the learning rate is halved, and training
+    goes on with the next batch.
+
     After every epoch `checkpoint.pt`, `model.pt` and `history.csv` in `run` are up to date; called again
     with the same settings it goes on from there and ends with the weights of an uninterrupted run. Under
     torchrun every batch is shared out to the processes, and process 0 writes.
@@ -129,7 +132,7 @@ def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, r
 
     Raises:
         InputError: nothing to train on, or a checkpoint that is not of this run.
-        SimulationError: a rollout failed; names recording and step.
+        SimulationError: every rollout of an epoch failed; names recording and step.
     """
     cut = [shortened(dataset, settings.frames) for dataset in datasets]
     with processes() as group:
@@ -163,7 +166,7 @@ class _Training:
         if not (self.run / CHECKPOINT).exists():
             field.scale_to([_sample_features(dataset) for dataset in datasets if dataset.split("train")])
             warm_start(
-                field, datasets, self.settings.warm_start, self.settings.seed,
+                field, datasets, self.run, self.settings.warm_start, self.settings.seed,
                 lambda: 1e3 * mean_error(self.validate, FittedModel("rafl", field=field)), self.report,
             )  # fmt: skip
         return field
@@ -179,13 +182,14 @@ class _Training:
             self.history.append({"epoch": 0, "loss": math.nan, "validation_mm": first, "learning_rate": 0.0})
             self._save(best=True)
         while self.history[-1]["epoch"] < self.settings.epochs and not self._stale():
-            rate = float(self.schedule.get_last_lr()[0])
-            loss = self._epoch()
+            loss, failed = self._epoch()
+            rate = float(self.optimiser.param_groups[0]["lr"])
             self.schedule.step()
             error = self.group.agree(1e3 * mean_error(self.validate, model))
             best = error < min(row["validation_mm"] for row in self.history)
             epoch = self.history[-1]["epoch"] + 1
-            self.history.append({"epoch": epoch, "loss": loss, "validation_mm": error, "learning_rate": rate})
+            row = {"epoch": epoch, "loss": loss, "validation_mm": error, "learning_rate": rate}
+            self.history.append(row | ({"failed": failed} if failed else {}))
             self._save(best)
         self.group.wait()
         return load_model(self.run)
@@ -193,39 +197,59 @@ class _Training:
     def _stale(self) -> bool:
         return stale([row["validation_mm"] for row in self.history], self.settings.patience)
 
-    def _epoch(self) -> float:
-        """Mean loss of one pass over the recordings."""
-        total = 0.0
+    def _epoch(self) -> tuple[float, int]:
+        """Mean loss of one pass over the recordings, and how many updates failed."""
+        total, count, failed = 0.0, 0, 0
         order = torch.randperm(len(self.items), generator=self.shuffle).tolist()
         for first in range(0, len(order), self.settings.batch):
             together = [self.items[k] for k in order[first : first + self.settings.batch]]
-            total += len(together) * self._update(together)
-        return total / len(order)
+            try:
+                total += len(together) * self._update(together)
+                count += len(together)
+            except SimulationError:
+                failed += 1
+                if first + self.settings.batch >= len(order) and count == 0:
+                    raise
+                self._retreat()
+        return total / count, failed
 
     def _update(self, together: list[Item]) -> float:
-        """One step of the optimiser; the batch's mean loss."""
+        """One step of the optimiser; the batch's mean loss.
+
+        Raises:
+            SimulationError: a simulation failed in one of the processes; raised in all.
+        """
         self.optimiser.zero_grad()
-        mean = torch.zeros(1, dtype=torch.float64)
-        for recordings in batches(self.group.mine(together), self.settings.by_sigma):
-            force = self.field.on(recordings.dataset.simulator, torch.float32)
-            simulated, forces = recordings.simulate(force)
-            loss = training_loss(recordings, simulated, forces, self.settings.force_penalty)
-            loss = loss * len(recordings.names) / len(together)
-            loss.backward()
-            mean += loss.detach()
+        mean, failures = torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+        reason = f"a simulation of {', '.join(item.name for item in together)} failed in epoch {len(self.history)}"
+        try:
+            for recordings in batches(self.group.mine(together), self.settings.by_sigma):
+                force = self.field.on(recordings.dataset.simulator, torch.float32)
+                simulated, forces = recordings.simulate(force)
+                loss = training_loss(recordings, simulated, forces, self.settings.force_penalty)
+                loss = loss * len(recordings.names) / len(together)
+                loss.backward()
+                mean += loss.detach()
+        except SimulationError as error:
+            failures += 1.0
+            reason = f"{reason}: {error}"
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.field.parameters()]
-        self.group.add_up([*gradients, mean])
+        self.group.add_up([*gradients, mean, failures])
         for parameter, gradient in zip(self.field.parameters(), gradients, strict=True):
             parameter.grad = gradient
         size = torch.nn.utils.clip_grad_norm_(self.field.parameters(), GRADIENT_LIMIT)
-        if not torch.isfinite(size):
-            names = ", ".join(item.name for item in together)
-            raise SimulationError(
-                f"the gradient of recordings {names} is not finite in epoch {len(self.history)}; "
-                "lower the learning rate"
-            )
+        if failures > 0 or not torch.isfinite(size):
+            raise SimulationError(f"{reason}; lower the learning rate")
         self.optimiser.step()
         return mean.item()
+
+    def _retreat(self) -> None:
+        """To the best field so far, with half the learning rate and nothing in Adam's memory."""
+        self.group.wait()  # what process 0 wrote is read
+        self.field.load_state_dict(field_of(self.run).state_dict())
+        self.optimiser.state.clear()
+        for group in self.optimiser.param_groups:
+            group["lr"] *= 0.5
 
     def _resume(self) -> None:
         saved = load_tensors(self.run / CHECKPOINT, "a checkpoint of this run")

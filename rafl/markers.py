@@ -31,6 +31,11 @@ class Markers:
     weights: Array
     normal_offset: Array
 
+    def some(self, chosen: NDArray[np.int64]) -> "Markers":
+        """Those of some rows."""
+        names = tuple(self.names[k] for k in chosen)
+        return Markers(names, self.rest[chosen], self.quad[chosen], self.weights[chosen], self.normal_offset[chosen])
+
     def positions(self, q: Tensor) -> Tensor:
         """Marker positions [m], (..., M, 3), at mesh positions q (..., N, 3); differentiable."""
         return self._from_corners(q[..., torch.from_numpy(self.quad), :])

@@ -17,7 +17,7 @@ METHODS: dict[str, Trainer] = {
     "srl": fit_supervised,
     **dict.fromkeys(SOUGHT, identify_material),
 }
-EPOCHS = {"rafl": 60, "srl": 1000, **dict.fromkeys(SOUGHT, 40)}  # at most, where the user does not say
+EPOCHS = {"rafl": 30, "srl": 1000, **dict.fromkeys(SOUGHT, 40)}  # at most, where the user does not say
 
 
 def check_inputs(method: str, datasets: list[Dataset], start: Path | None) -> None:

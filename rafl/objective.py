@@ -1,6 +1,6 @@
 """How far a simulation is from a recording: the training loss and the reported error."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,6 +49,12 @@ class Recordings:
             own = (usual / np.maximum(item.sigma, LEAST_SIGMA * usual)) ** 2 if by_sigma else 1.0
             weight[: len(item.time), b] = item.valid[..., None] * own
         return cls(dataset, names, *(torch.from_numpy(array) for array in (markers, valid, weight)))
+
+    def of_markers(self, chosen: NDArray[np.int64]) -> "Recordings":
+        """The same recordings with some of the markers only."""
+        dataset = replace(self.dataset, markers=self.dataset.markers.some(chosen))
+        rest = (array[:, :, chosen] for array in (self.markers, self.valid, self.weight))
+        return Recordings(dataset, self.names, *rest)
 
     def simulate(
         self, residual: ResidualForce | None = None, parameters: Parameters | None = None

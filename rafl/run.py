@@ -64,7 +64,7 @@ class Settings:
         seed: of the initial weights and the order of recordings.
         batch: recordings an update.
         force_penalty: the paper's lambda_1 [m^2/N^2].
-        warm_start: passes over the equations of motion before the first simulation.
+        warm_start: passes over the forces that follow the recordings step by step, before the first simulation.
         start: run folder whose model training goes on from; empty for new weights.
         by_sigma: whether markers count by their uncertainty.
     """

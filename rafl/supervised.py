@@ -1,42 +1,29 @@
 """Supervised residual learning (paper, SRL baseline, after Gao et al.): targets, then a network to give them."""
 
 import math
-from functools import partial
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from groundwork import InputError, progress
+from groundwork import InputError
 from rafl.dataset import Dataset
-from rafl.fit import Report, batches, mean_error, shortened, training_items, validation_batches
+from rafl.fit import Report, mean_error, shortened, training_items, validation_batches
 from rafl.global_residual import GlobalResidual
-from rafl.run import (
-    FORMAT,
-    FittedModel,
-    Settings,
-    load_model,
-    load_tensors,
-    save_model,
-    save_tensors,
-    stale,
-    write_history,
-)
-from rafl.targets import residual_targets
+from rafl.run import FittedModel, Settings, load_model, save_model, stale, write_history
+from rafl.targets import training_targets
 
 STATES = 256  # an update
 RATE = 1e-3  # Adam's, at the start of the cosine decay
 JUDGED = 25  # epochs between rollouts of the validation recordings
 PATIENCE = 8  # of these without gain end the training
-PENALTY = 1e-4  # lambda_1 of the targets [m^2/N^2]
-TARGETS = "targets.pt"
 
 
 def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
     """Solve for each step's residual force, then train a `GlobalResidual` to give it.
 
-    Targets stand in `targets.pt` of the run and are not computed again. The network that simulates the validation
-    recordings best is kept; it is asked every 25th epoch.
+    Targets stand in the run's `targets-<dataset>.pt` and are not computed again. The network that simulates the
+    validation recordings best is kept; it is asked every 25th epoch.
 
     Raises:
         InputError: nothing to train on, or datasets of different meshes.
@@ -98,19 +85,9 @@ def one_mesh(datasets: list[Dataset]) -> int:
 
 def _lessons(datasets: list[Dataset], run: Path) -> tuple[Tensor, Tensor]:
     """States (S, 6 N) and target forces (S, 3 N), in single precision."""
-    path = run / TARGETS
-    if not path.exists():
-        states, forces = [], []
-        with progress() as bar:
-            for recordings in batches(training_items(datasets)):
-                steps = len(recordings.markers) - 1
-                task = bar.add_task(f"{recordings.dataset.name}: residual forces", total=steps)
-                targets = residual_targets(recordings, PENALTY, partial(bar.advance, task))
-                chosen = recordings.valid[1:].amax(-1).bool()
-                state = torch.cat([torch.from_numpy(x).flatten(2) for x in (targets.q, targets.v)], dim=-1)
-                states.append(state[chosen].float())
-                forces.append(torch.from_numpy(targets.force).flatten(2)[chosen].float())
-        content: dict[str, object] = {"states": torch.cat(states), "forces": torch.cat(forces)}
-        save_tensors(path, {"format": FORMAT, "method": "srl", **content})
-    saved = load_tensors(path, "residual forces of this run")
-    return saved["states"], saved["forces"]
+    states, forces = [], []
+    for number, dataset in enumerate(dataset for dataset in datasets if dataset.split("train")):
+        q, v, force = training_targets(dataset, run / f"targets-{number}.pt")
+        states.append(torch.cat([q.flatten(1), v.flatten(1)], dim=1).float())
+        forces.append(force.flatten(1).float())
+    return torch.cat(states), torch.cat(forces)

@@ -2,19 +2,27 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
+from torch import Tensor
 
+from groundwork import progress
+from rafl.dataset import Dataset
 from rafl.errors import SimulationError
+from rafl.integrator import INTEGRATORS, State
 from rafl.objective import Recordings
+from rafl.run import FORMAT, load_tensors, save_tensors
 from rafl.simulator import Simulator
 
 Array = NDArray[Any]
 
+PENALTY = 1e-4  # lambda_1 of the targets that are learned from [m^2/N^2]
 MOST_ITERATIONS = 12
 ENOUGH = 1e-8  # of the objective: a smaller gain ends the iteration
 
@@ -51,9 +59,9 @@ def residual_targets(recordings: Recordings, penalty: float, tick: Callable[[], 
     """
     dataset = recordings.dataset
     simulator = dataset.simulator
-    if simulator.integrator != "implicit-euler" or simulator.substeps != 1 or simulator.parameters().damped:
+    if not can_be_followed(simulator):
         raise SimulationError(
-            f"{dataset.name}: expected implicit-euler, one substep and no damping for residual targets, found "
+            f"{dataset.name}: expected implicit-euler, one substep and no viscous damping for residual targets, found "
             f"{simulator.integrator}, {simulator.substeps} substeps; fit another method"
         )
     start = dataset.start(recordings.names)
@@ -69,6 +77,37 @@ def residual_targets(recordings: Recordings, penalty: float, tick: Callable[[], 
         q, v = after, (after - q) / simulator.time_step
         tick()
     return Targets(*(np.stack(part) for part in zip(*parts, strict=True)))
+
+
+def can_be_followed(simulator: Simulator) -> bool:
+    """Whether residual targets can be solved for: steps by plain backward differences, no viscous damping."""
+    return simulator.integrator == "implicit-euler" and simulator.substeps == 1 and not simulator.parameters().damped
+
+
+def training_targets(dataset: Dataset, path: Path, most: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    """States q, v at the start of all training recordings' steps and the residual forces that follow, all (S, N, 3).
+
+    Args:
+        dataset: with training recordings.
+        path: keeps them; where it exists it is read.
+        most: how many markers, evenly spread, are followed; all unless given.
+
+    Raises:
+        SimulationError: the recordings cannot be followed.
+    """
+    if not path.exists():
+        recordings = Recordings.of(dataset, dataset.split("train"))
+        if most is not None and len(dataset.markers.names) > most:
+            chosen = np.random.default_rng(0).choice(len(dataset.markers.names), most, replace=False)
+            recordings = recordings.of_markers(np.sort(chosen))
+        with progress() as bar:
+            task = bar.add_task(f"{dataset.name}: residual forces", total=len(recordings.markers) - 1)
+            targets = residual_targets(recordings, PENALTY, lambda: bar.advance(task))
+        shown = recordings.valid[1:].amax(-1).bool()
+        content = {key: torch.from_numpy(getattr(targets, key))[shown] for key in ("q", "v", "force")}
+        save_tensors(path, {"format": FORMAT, "method": "residual forces", **content})
+    saved = load_tensors(path, "residual forces of this run")
+    return saved["q"], saved["v"], saved["force"]
 
 
 @dataclass(frozen=True)
@@ -115,13 +154,21 @@ class _Step:
         return x, force, objective
 
     def _after(self, force: Array, guess: Array | None) -> Array:
-        h = self.simulator.time_step
-        target = self.q + h * self.v
-        begin = target.copy() if guess is None else guess.copy()
+        inertia, target = self._inertia
+        begin = self.q + self.simulator.time_step * self.v if guess is None else guess.copy()
         begin[:, self.simulator.fixed] = self.q[:, self.simulator.fixed]
         what = f"step {self.number} of {', '.join(self.recordings.names)}"
         resistance = self.simulator.resistance(len(self.q))
-        return self.simulator.minimise(begin, self.mass / h**2, target, self.external + force, resistance, what)
+        return self.simulator.minimise(begin, inertia, target, self.external + force, resistance, what)
+
+    @cached_property
+    def _inertia(self) -> tuple[Array, Array]:
+        """Inertia (B, N) [kg/s^2] and where it draws the nodes, (B, N, 3) [m]."""
+        q, v, mass = (torch.from_numpy(x) for x in (self.q, self.v, self.mass))
+        damping = torch.full((len(q), 1), self.simulator.material.mass_damping, dtype=torch.float64)
+        state = State(q, v, torch.zeros_like(q))
+        problem = INTEGRATORS[self.simulator.integrator].problem(state, mass, damping, self.simulator.time_step)
+        return problem.inertia.numpy(), problem.target.numpy()
 
     def _judge(self, x: Array, force: Array) -> tuple[Array, Array]:
         """Marker gaps (B, 3 M) [m], nought where not seen, and the objective (B)."""
@@ -139,7 +186,7 @@ class _Step:
         right = np.zeros((batch, count, 3, x.shape[1], 3))
         for corner in range(4):
             right[:, np.arange(count), :, quad[:, corner]] += by_corner[:, :, :, corner].swapaxes(0, 1)
-        diagonal = np.repeat(self.mass / self.simulator.time_step**2, 3, axis=1)[:, engine.free_index]
+        diagonal = np.repeat(self._inertia[0], 3, axis=1)[:, engine.free_index]
         with engine.threads(batch):
             tangents = engine.terms(x, self.simulator.resistance(batch), tangent=True)[2]
             columns = np.ascontiguousarray(right.reshape(batch, 3 * count, -1)[:, :, engine.free_index])

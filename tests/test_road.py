@@ -44,7 +44,7 @@ def test_from_a_filmed_specimen_to_a_fitted_model(specimen_file: Path, run: Run,
     )
     said = walk("rafl-capture", specimen_file, "tracks", "--recordings", "recordings.csv", "--out", "small.h5")
     assert "next: rafl-fit small.h5" in said
-    said = walk("rafl-fit", "small.h5", "--out", "run", "--epochs", "10", "--learning-rate", "0.005")
+    said = walk("rafl-fit", "small.h5", "--out", "run", "--epochs", "10", "--learning-rate", "0.002")
     assert "next: rafl-eval run small.h5" in said
     said = walk("rafl-fit", "small.h5", "--out", "sysid", "--method", "sysid", "--epochs", "4", "--frames", "10")
     assert "identified E" in said

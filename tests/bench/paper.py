@@ -135,7 +135,7 @@ class Study:
         """Every shape by every method that works on it."""
         trained = self.plan["trained_on"]
         own = [self.dataset(trained, "train", "val")]
-        rafl = self.fit("rafl", "rafl", own, epochs=self.effort.rafl, batch=1, force_penalty=1e-6, warm_start=12)
+        rafl = self.fit("rafl", "rafl", own, epochs=self.effort.rafl, batch=1, force_penalty=1e-6, warm_start=20)
         srl = self.fit("srl", "srl", own, epochs=self.effort.srl)
         rows: list[dict[str, Any]] = []
         for shape, mesh in self.meshes.items():
@@ -165,7 +165,7 @@ class Study:
         rows: list[dict[str, Any]] = []
         for shape in BEAMS:
             others = [self.few(other) for other in BEAMS if other != shape]
-            model = self.fit(f"without-{shape}", "rafl", others, epochs=self.effort.left_out, warm_start=12)
+            model = self.fit(f"without-{shape}", "rafl", others, epochs=self.effort.left_out, warm_start=20)
             rows += [{**row, "paper_mean_mm": np.nan} for row in self.errors(shape, {"rafl-of-the-others": model})]
         return pd.DataFrame(rows, columns=COLUMNS)
 
@@ -181,7 +181,7 @@ def time_to_accuracy(study: Study) -> None:
     run = study.out / "runs" / "clock"
     shutil.rmtree(run, ignore_errors=True)
     run.mkdir(parents=True)
-    settings = Settings("rafl", ("canonical",), 20, 2e-3, 1e-5, 20, 0, SEED, force_penalty=1e-6, warm_start=12)
+    settings = Settings("rafl", ("canonical",), 20, 1e-3, 1e-5, 20, 0, SEED, force_penalty=1e-6, warm_start=20)
     begun = last = time.perf_counter()
     measuring = 0.0
 

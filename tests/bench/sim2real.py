@@ -56,7 +56,7 @@ class Effort:
     epochs: dict[str, int]
 
 
-FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 40})
+FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12})
 QUICK = Effort(
     ("canonical", "thicker-scaled", "shorter"), (3, 1, 2), 50, {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8}
 )

@@ -10,7 +10,7 @@ from groundwork import InputError
 from rafl import fit
 from rafl.dataset import Dataset
 from rafl.errors import SimulationError
-from rafl.fit import fit_residual_field, mean_error, training_items
+from rafl.fit import fit_residual_field, mean_error, training_items, validation_batches
 from rafl.mesh import HexMesh
 from rafl.objective import Recordings
 from rafl.run import FittedModel, Settings, load_model
@@ -35,6 +35,16 @@ def test_training_lowers_the_error_on_held_out_recordings(dataset: Dataset, tmp_
     model = fit_residual_field([dataset], replace(SETTINGS, epochs=12, learning_rate=5e-3, frames=0), tmp_path, silent)
     held_out = [Recordings.of(dataset, ["d"])]
     assert mean_error(held_out, model) < 0.5 * mean_error(held_out, FittedModel("original"))
+
+
+def test_a_field_that_tears_the_body_apart_is_given_up(dataset: Dataset, tmp_path: Path) -> None:
+    """Steps far too long: training goes on from the best field with shorter ones, and says what failed."""
+    rows: list[dict[str, float]] = []
+    settings = replace(SETTINGS, epochs=8, learning_rate=2.0, frames=0)
+    model = fit_residual_field([dataset], settings, tmp_path, rows.append)
+    assert any(row.get("failed", 0) > 0 for row in rows)
+    assert rows[-1]["learning_rate"] < 0.5 * rows[1]["learning_rate"]
+    assert 1e3 * mean_error(validation_batches([dataset]), model) == min(row["validation_mm"] for row in rows)
 
 
 def test_an_interrupted_run_ends_like_an_uninterrupted_one(dataset: Dataset, tmp_path: Path) -> None:

@@ -1,9 +1,11 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from rafl import targets
 from rafl.dataset import Dataset
 from rafl.fit import mean_error
 from rafl.material import Material
@@ -13,7 +15,8 @@ from rafl.residual import ResidualField
 from rafl.run import FittedModel
 from rafl.simulator import Simulator
 from rafl.synthetic import hung, released, twisted, vertex_markers, with_material
-from rafl.warm_start import missing_forces, shows_every_vertex, warm_start
+from rafl.targets import training_targets
+from rafl.warm_start import warm_start
 
 MESH = HexMesh.box((4, 2, 2), (0.06, 0.02, 0.02))
 BASE = Simulator(MESH, Material(), MESH.face_nodes("x-min"))
@@ -41,46 +44,43 @@ def test_a_twist_keeps_sections_plane_and_turns_the_tip() -> None:
     np.testing.assert_allclose(q[..., 0], np.broadcast_to(MESH.vertices[:, 0], q.shape[:2]))
 
 
-def test_missing_forces_make_the_simulator_follow(seen: Dataset) -> None:
-    """Each step of the untouched simulator, the missing force added, ends where the recording does."""
-    missing = missing_forces(seen, ["c"])
-    recorded = seen.trajectories["c"].markers
-    for t in (0, 5, 18):
-        force = torch.from_numpy(missing.force[t : t + 1])
-        state = (missing.q[t : t + 1], missing.v[t : t + 1])
-        h = BASE.time_step
-        inertia = np.repeat(BASE.node_mass[None] / h**2, 1, axis=0)
-        after = BASE.minimise(
-            state[0].copy(), inertia, state[0] + h * state[1], BASE.weight + force.numpy(), BASE.resistance(1), "step"
-        )
-        np.testing.assert_allclose(after[0], recorded[t + 1], atol=1e-9)
-    itself = released("own", BASE, BASE, seen.trajectories["c"].q[None], 10, {"a": "train"})
-    assert np.abs(missing_forces(itself, ["a"]).force).max() < 1e-6
+def test_the_lesson_needs_no_simulation_and_helps(seen: Dataset, tmp_path: Path) -> None:
+    """Of every vertex, of some of them, and where mass damping acts too."""
+    few = replace(seen, markers=seen.markers.some(np.arange(6, 45, 4)), trajectories={
+        name: replace(item, **{key: getattr(item, key)[:, 6:45:4] for key in ("markers", "valid", "sigma")})
+        for name, item in seen.trajectories.items()
+    })  # fmt: skip
+    damped = replace(seen, simulator=replace(BASE, material=replace(BASE.material, mass_damping=2.0)))
+    for number, dataset in enumerate((seen, few, damped)):
+        torch.manual_seed(2)
+        field = ResidualField()
+        validate = [Recordings.of(dataset, ["b"])]
+        rows: list[dict[str, float]] = []
+        model = FittedModel("rafl", field=field)
+        run = tmp_path / str(number)
+        warm_start(field, [dataset], run, 15, 0, lambda: 1e3 * mean_error(validate, model), rows.append)  # noqa: B023
+        assert rows[-1]["missing"] < 0.5 * rows[0]["missing"]
+        assert mean_error(validate, model) < 0.3 * mean_error(validate, FittedModel("original"))
+        assert 1e3 * mean_error(validate, model) <= min(row["validation_mm"] for row in rows) + 1e-9
 
 
-def test_the_lesson_needs_no_simulation_and_helps(seen: Dataset) -> None:
-    torch.manual_seed(2)
-    field = ResidualField()
-    validate = [Recordings.of(seen, ["b"])]
-    rows: list[dict[str, float]] = []
-    model = FittedModel("rafl", field=field)
-    warm_start(field, [seen], 15, 0, lambda: 1e3 * mean_error(validate, model), rows.append)
-    assert rows[-1]["missing"] < rows[0]["missing"]
-    assert mean_error(validate, model) < 0.5 * mean_error(validate, FittedModel("original"))
-    assert 1e3 * mean_error(validate, model) <= min(row["validation_mm"] for row in rows) + 1e-9
+def test_the_forces_are_kept_for_an_interrupted_run(
+    seen: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = training_targets(seen, tmp_path / "targets-0.pt", 20)
+    monkeypatch.setattr(targets, "residual_targets", None)
+    for once, again in zip(first, training_targets(seen, tmp_path / "targets-0.pt", 20), strict=True):
+        assert torch.equal(once, again)
 
 
-def test_who_does_not_show_every_vertex_teaches_nothing(seen: Dataset, dataset: Dataset) -> None:
-    assert shows_every_vertex(seen)
-    assert not shows_every_vertex(dataset)
-    assert not shows_every_vertex(replace(seen, simulator=replace(BASE, substeps=2)))
-    valid = seen.trajectories["a"].valid.copy()
-    valid[3, 4] = False
-    gap = {**seen.trajectories, "a": replace(seen.trajectories["a"], valid=valid)}
-    assert not shows_every_vertex(replace(seen, trajectories=gap))
+def test_what_cannot_be_followed_teaches_nothing(seen: Dataset, tmp_path: Path) -> None:
+    """Steps of another kind, or viscosity."""
     field = ResidualField()
     before = {key: value.clone() for key, value in field.state_dict().items()}
-    warm_start(field, [dataset], 3, 0, lambda: 0.0, lambda row: None)
+    material = replace(BASE.material, viscosity=20.0)
+    for simulator in (replace(BASE, substeps=2), replace(BASE, material=material)):
+        other = replace(seen, simulator=simulator)
+        warm_start(field, [other], tmp_path, 3, 0, lambda: 0.0, lambda row: None)
     assert all(torch.equal(value, before[key]) for key, value in field.state_dict().items())
 
 
