@@ -18,7 +18,7 @@ from tracking.shape import NEIGHBOURS, Pattern, carry
 
 Array = NDArray[Any]
 
-EVERY = 4  # frames from look to look
+EVERY, SOON = 12, 4  # frames from look to look; where the last one showed a dot that may be one
 LOOKS = 3  # one after the other that show a dot before it is believed
 KEPT, MOST_BYTES = 60, 2**28  # last pictures, in which a dot is followed back, and their size together
 FREE, FAR = 0.55, 1.8  # spacings: distances on the body from known markers between which there may be another
@@ -64,6 +64,7 @@ class Newcomers:
 
     family: Family
     candidates: list[_Candidate] = field(default_factory=list)
+    due: int = 0  # frame of the next look
     recent: deque[tuple[int, NDArray, Array]] = field(default_factory=deque)
 
     def look(
@@ -82,7 +83,7 @@ class Newcomers:
         self.recent.append((number, image, place))
         while len(self.recent) > max(min(KEPT, MOST_BYTES // image.nbytes), 1):
             self.recent.popleft()
-        if number % EVERY or seen.mean() < 0.5:
+        if number < self.due or seen.mean() < 0.5:
             return []
         found = self._strangers(image, place, pattern, parameters)
         rest = carry(place[seen], pattern.rest[seen], found)
@@ -90,6 +91,7 @@ class Newcomers:
         away = np.linalg.norm(rest[:, None] - pattern.rest[None], axis=2).min(axis=1) / spacing
         fit = (away > FREE) & (away < FAR)
         self._count(found[fit], rest[fit], number, SAME * spacing)
+        self.due = number + (SOON if self.candidates else EVERY)
         ready = [item for item in self.candidates if item.carried()]
         self.candidates = [item for item in self.candidates if item not in ready]
         followed = [self._followed_back(item, pattern, parameters, SAME * spacing) for item in ready]
