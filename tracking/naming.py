@@ -1,5 +1,6 @@
 """Which dot is which marker of the layout."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -9,12 +10,17 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from calibration.camera import Camera
 from groundwork import InputError
 from tracking.layout import MarkerLayout
+from tracking.shape import Pattern, match_shape
 
 Array = NDArray[Any]
 
 NEAR = 0.4  # of the local spacing: how far a dot may be from where its neighbours put it
 BEHIND = 0.3  # of the spacing: a marker nearer than this to one before it in the picture is covered
-TURNS = np.radians(np.concatenate([[0], np.repeat(np.arange(15, 181, 15), 2) * np.tile([1, -1], 12)]))
+FAR = 0.05  # of a dot: what one that stands a spacing from its guessed place counts less
+ENOUGH, SURE = 0.9, 1.07  # of all that may match: a score that ends the search, and, times that, ends it at once
+BENDS = np.radians(np.repeat(np.arange(15, 121, 15), 2) * np.tile([1, -1], 8))
+TURNS = np.radians(np.repeat(np.arange(15, 181, 15), 2) * np.tile([1, -1], 12))
+COMPACT = 0.6  # ratio of a layout's width and length, beyond which it may bend about either
 
 
 def visible_markers(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
@@ -50,10 +56,9 @@ def _not_behind_others(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64
 def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str) -> list[int]:
     """The layout marker of each dot (-1 for none).
 
-    A dot and a marker are taken to be the same, and names spread from there from neighbour to
-    neighbour, each step trusting the local affine map; of all such beginnings the one that names
-    most dots with the least bending wins. Only proper rotations are tried: a mirror image of the
-    layout is no match.
+    The specimen may be bent far and filmed from any side: from many guesses of how it stands, names spread from dot to
+    dot (`tracking.shape`), and the guess wins that names most dots with the least strain, nearest to where it puts
+    them. Only proper rotations are tried: a mirror image of the layout is no match.
 
     Args:
         dots: first frame [px], (D, 2).
@@ -69,80 +74,66 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
         markers = _not_behind_others(layout, camera)
     pixels = camera.undistort(dots)
     expected = camera.ideal(layout.positions[markers])
-    size = max(float(np.ptp(expected, axis=0).max()), 1.0)
-    best: tuple[float, dict[int, int]] = (-np.inf, {})
-    complete = min(len(dots), len(markers))
-    for turn in TURNS:
-        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-        for matches in _beginnings(expected, pixels, rotation):
-            # The calibrated position decides between a layout and its shifted copy.
-            away = np.mean([np.linalg.norm(pixels[d] - expected[m]) for m, d in matches.items()])
-            score = len(matches) - 0.3 * min(away / size, 1.0)
-            if score > best[0]:
-                best = (score, matches)
-        if len(best[1]) == complete:
+    best: tuple[float, Array] = (-np.inf, np.full(len(markers), -1))
+    enough = ENOUGH * min(len(pixels), len(markers))
+    for shapes in _guesses(expected):
+        for shape in shapes:
+            found = match_shape(Pattern.of(shape), pixels, FAR)
+            best = max(best, found, key=lambda pair: pair[0])
+            if shape is expected and best[0] > SURE * enough:
+                break
+        if best[0] > enough:
             break
-    if len(best[1]) < 3:
+    matched = np.flatnonzero(best[1] >= 0)
+    if len(matched) < 3:
         raise InputError(
-            f"{what}: expected dots in the pattern of the specimen's markers, found {len(best[1])} of "
+            f"{what}: expected dots in the pattern of the specimen's markers, found {len(matched)} of "
             f"{len(markers)} that match; check --specimen, and that calib.yaml belongs to this set-up"
         )
     names = [-1] * len(dots)
-    for marker, dot in best[1].items():
-        names[dot] = int(markers[marker])
+    for marker in matched:
+        names[best[1][marker]] = int(markers[marker])
     return names
 
 
-def _beginnings(expected: Array, dots: Array, rotation: Array) -> list[dict[int, int]]:
-    """Matches grown from every marker and its five likeliest dots."""
-    turned = (expected - expected.mean(0)) @ rotation.T + expected.mean(0)
-    likely = cKDTree(dots).query(turned, min(5, len(dots)))[1].reshape(len(expected), -1)
-    grown = []
-    for marker in range(0, len(expected), max(len(expected) // 8, 1)):
-        for dot in likely[marker]:
-            grown.append(_grow(expected, dots, rotation, marker, int(dot)))
-            if len(grown[-1]) == min(len(dots), len(expected)):
-                return grown
-    return grown
+def _guesses(expected: Array) -> Iterator[list[Array]]:
+    """How the markers may stand in the picture, (M, 2) each: first bent more or less, then turned, then both."""
+    bends = [expected, *_bent(expected, BENDS)]
+    yield bends
+    turned = [_turned(expected, turn) for turn in TURNS]
+    yield turned
+    yield [_turned(shape, turn) for turn in TURNS[1::2] for shape in _bent(expected, BENDS[1::3])]
 
 
-def _grow(expected: Array, dots: Array, rotation: Array, marker: int, dot: int) -> dict[int, int]:
-    tree = cKDTree(dots)
-    between = np.linalg.norm(expected[:, None] - expected[None], axis=2)
-    spacing = np.sort(between + np.diag(np.full(len(expected), np.inf)), axis=1)[:, 0]
-    matches = {marker: dot}
-    taken = {dot}
-    rejected: set[int] = set()
-    while len(matches) + len(rejected) < len(expected):
-        known = np.array(list(matches))
-        rest = [m for m in range(len(expected)) if m not in matches and m not in rejected]
-        nearest = min(rest, key=lambda m: between[m, known].min())
-        around = known[np.argsort(between[nearest, known])[:5]]
-        prediction = _carried(expected, dots, rotation, matches, around, nearest)
-        distance, found = tree.query(prediction)
-        if distance < NEAR * spacing[nearest] and int(found) not in taken:
-            matches[nearest] = int(found)
-            taken.add(int(found))
-        else:
-            rejected.add(nearest)
-    return matches
+def _turned(places: Array, turn: float) -> Array:
+    middle = places.mean(axis=0)
+    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+    return (places - middle) @ rotation.T + middle
 
 
-def _carried(
-    expected: Array, dots: Array, rotation: Array, matches: dict[int, int], around: Array, marker: int
-) -> Array:
-    """Where the neighbours' affine map, drawn towards the start's rotation, puts a marker."""
-    source = expected[around]
-    target = dots[[matches[int(m)] for m in around]]
-    weight = 1.0 / (1e-9 + np.linalg.norm(source - expected[marker], axis=1))
-    weight /= weight.sum()
-    source_mean, target_mean = weight @ source, weight @ target
-    source, target = source - source_mean, target - target_mean
-    size = (weight[:, None] * source**2).sum()
-    ridge = 0.03 * size + 1e-9
-    moment = (weight[:, None] * source).T @ source
-    affine = ((weight[:, None] * target).T @ source + ridge * rotation) @ np.linalg.inv(moment + ridge * np.eye(2))
-    return target_mean + affine @ (expected[marker] - source_mean)
+def _bent(places: Array, angles: Array) -> list[Array]:
+    """Places on a body that is held at either end and bent in the picture, or out of it, by angles at the other."""
+    middle = places.mean(axis=0)
+    _, size, axes = np.linalg.svd(places - middle, full_matrices=False)
+    shapes = []
+    for along in axes[: 2 if size[1] > COMPACT * size[0] else 1]:
+        across = np.array([-along[1], along[0]])
+        s, h = (places - middle) @ along, (places - middle) @ across
+        for end, way in ((s.min(), 1.0), (s.max(), -1.0)):
+            length = np.ptp(s)
+            u = np.linspace(0.0, 1.0, 101)
+            mine = way * (s - end) / length
+            for angle in angles:
+                for form in (2.0 * u - u**2, u):  # a load at the tip, and a pure moment
+                    slope = angle * form
+                    steps = np.stack([np.cos(slope), np.sin(slope)], axis=1) * length / (len(u) - 1)
+                    line = np.concatenate([[[0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
+                    x, y, own = (np.interp(mine, u, values) for values in (*line.T, slope))
+                    in_it = (x - h * way * np.sin(own), y + h * way * np.cos(own))
+                    out_of_it = (x, h * way)
+                    for forth, side in (in_it, out_of_it) if angle > 0 and form[50] > 0.5 else (in_it,):
+                        shapes.append(middle + (end + way * forth)[:, None] * along + (way * side)[:, None] * across)
+    return shapes
 
 
 def name_by_rows(dots: Array, late: int = 0) -> list[str]:

@@ -292,6 +292,21 @@ def recognise(
     return best
 
 
+def match_shape(pattern: Pattern, dots: Array, far: float) -> tuple[float, NDArray[np.int64]]:
+    """The best match of dots (D, 2) to a pattern in the shape and about the place where it is at rest, (M), -1 for
+    none, and its score: about how many markers it explains.
+
+    Args:
+        pattern: the markers.
+        dots: of a picture [px], (D, 2).
+        far: what a dot one spacing from its place counts less.
+    """
+    search = _Search.of(pattern, dots)
+    seeds = search.seeds(pattern.rest, np.zeros(len(pattern.rest)), np.inf)
+    match, score = search.grow(pattern.rest, pattern.rest, np.tile(np.eye(2), (len(pattern.rest), 1, 1)), far, seeds)
+    return score, match
+
+
 @dataclass(frozen=True)
 class _Search:
     """The dots of a picture, ready to be searched."""

@@ -72,6 +72,31 @@ def test_dots_in_any_order_get_their_names(turn: float, bend: float, shift: floa
         assert sorted(names) == list(range(16))
 
 
+def hanging(places: np.ndarray, slope: float) -> np.ndarray:
+    """Bent without stretching, the slope growing as in a cantilever to `slope` rad at the tip."""
+    s = np.linspace(0.0, 1.02 * places[:, 0].max(), 500)
+    angle = slope * (2.0 * s / s[-1] - (s / s[-1]) ** 2)
+    step = s[1]
+    line = np.cumsum(np.stack([np.cos(angle), -np.sin(angle)]) * step, axis=1) - step * np.array([[1.0], [0.0]])
+    middle = 0.5 * (places[:, 2].max() + places[:, 2].min())
+    x, z, own = (np.interp(places[:, 0], s, values) for values in (*line, angle))
+    bent = places.copy()
+    bent[:, 0] = x + (places[:, 2] - middle) * np.sin(own)
+    bent[:, 2] = middle + z + (places[:, 2] - middle) * np.cos(own)
+    return bent
+
+
+@pytest.mark.parametrize("slope_deg", [-80, -60, 35, 50, 65, 80])
+@pytest.mark.parametrize("name", ["canonical", "thinner", "longer", "shorter"])
+@pytest.mark.parametrize("lost", [0, 2])
+def test_far_bent_beams_get_their_names(name: str, slope_deg: float, lost: int) -> None:
+    """Rows stand nearer than columns, and the tip hangs below the clamp."""
+    layout = read_layout(Path(__file__).parents[2] / "datasets" / "specimens" / f"{name}.yaml")
+    seen = np.random.default_rng(lost + 7).permutation(visible_markers(layout, CAMERA))[lost:]
+    dots = CAMERA.project(hanging(layout.positions[seen], np.radians(slope_deg)))
+    assert name_by_layout(dots, layout, CAMERA, "a video") == seen.tolist()
+
+
 def test_missing_and_false_dots(random: np.random.Generator) -> None:
     dots = filmed(bend=0.02)
     kept = np.delete(np.arange(16), [3, 12])
