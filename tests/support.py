@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 ROOT = Path(__file__).parent.parent
-SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared"))
+SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared")).resolve()
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
