@@ -66,7 +66,9 @@ def fit(
     warm_start: Annotated[
         int, typer.Option(min=0, help="Passes over the forces that follow the recordings step by step, first (rafl).")
     ] = 20,
-    start: Annotated[Path | None, typer.Option("--from", help="Run to fine-tune (rafl).")] = None,
+    start: Annotated[
+        Path | None, typer.Option("--from", help="Run to fine-tune, or a sysid run whose material to correct (rafl).")
+    ] = None,
     by_sigma: Annotated[
         bool, typer.Option("--by-sigma", help="Weigh markers by their uncertainty (rafl, sysid).")
     ] = False,
@@ -88,7 +90,7 @@ def fit(
     epochs = epochs or EPOCHS[method]
     settings = Settings(
         method, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
-        weight_decay, patience, frames, seed, batch, force_penalty, warm_start if start is None else 0,
+        weight_decay, patience, frames, seed, batch, force_penalty, warm_start,
         str(start.resolve()) if start else "", by_sigma,
     )  # fmt: skip
     first = rank() == 0  # of the processes that torchrun started
@@ -155,7 +157,8 @@ def _open_run(run: Path, settings: Settings, resume: bool) -> None:
 def _described(model: FittedModel) -> str:
     if model.material is not None:
         e, nu = model.material["youngs_modulus"], model.material["poissons_ratio"]
-        return f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
+        identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
+        return identified if model.field is None else f"trained a residual acceleration field on {identified}"
     if model.network is not None:
         return f"trained a supervised residual network for meshes of {model.network.nodes} vertices"
     return "trained a residual acceleration field"

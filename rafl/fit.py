@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -102,16 +103,22 @@ def mean_error(sets: list[Recordings], model: FittedModel) -> float:
     return float(np.concatenate(errors).mean())
 
 
-def field_of(run: Path) -> ResidualField:
-    """The field that an earlier run trained.
+def model_to_go_on_from(run: Path) -> FittedModel:
+    """The field that an earlier run trained, or the material that it identified, or both.
 
     Raises:
         InputError: no run there, or one of another method.
     """
     model = load_model(run)
-    if model.field is None:
-        raise InputError(f"expected a run of method rafl in {run} to go on from, found {model.method}")
-    return model.field
+    if model.network is not None:
+        raise InputError(f"expected a run of method rafl or sysid in {run} to go on from, found {model.method}")
+    return model
+
+
+def _of_material(dataset: Dataset, identified: dict[str, float] | None) -> Dataset:
+    values: dict[str, Any] = dict(identified or {})
+    simulator = dataset.simulator
+    return replace(dataset, simulator=replace(simulator, material=replace(simulator.material, **values)))
 
 
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
@@ -147,10 +154,15 @@ class _Training:
     ) -> None:
         self.settings, self.run, self.group = settings, run, group
         self.report: Report = report if group.first else lambda row: None
+        start = model_to_go_on_from(Path(settings.start)) if settings.start else FittedModel("rafl")
+        datasets = [_of_material(dataset, start.material) for dataset in datasets]
         self.items, self.validate = training_items(datasets), validation_batches(datasets)
         self.history: list[dict[str, float]] = []
         torch.manual_seed(settings.seed)
-        self.field = self._first_field(datasets)
+        self.field = ResidualField() if start.field is None else start.field
+        self.model = FittedModel("rafl", field=self.field, material=start.material)
+        if start.field is None and not (run / CHECKPOINT).exists():
+            self._teach(datasets)
         self.optimiser = torch.optim.Adam(
             self.field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
@@ -159,33 +171,28 @@ class _Training:
         )
         self.shuffle = torch.Generator().manual_seed(settings.seed)
 
-    def _first_field(self, datasets: list[Dataset]) -> ResidualField:
-        if self.settings.start:
-            return field_of(Path(self.settings.start))
-        field = ResidualField()
-        if not (self.run / CHECKPOINT).exists():
-            field.scale_to([_sample_features(dataset) for dataset in datasets if dataset.split("train")])
-            warm_start(
-                field, datasets, self.run, self.settings.warm_start, self.settings.seed,
-                lambda: 1e3 * mean_error(self.validate, FittedModel("rafl", field=field)), self.report,
-            )  # fmt: skip
-        return field
+    def _teach(self, datasets: list[Dataset]) -> None:
+        """A new field's scale and first lesson."""
+        self.field.scale_to([_sample_features(dataset) for dataset in datasets if dataset.split("train")])
+        warm_start(
+            self.field, datasets, self.run, self.settings.warm_start, self.settings.seed,
+            lambda: 1e3 * mean_error(self.validate, self.model), self.report,
+        )  # fmt: skip
 
     def go(self) -> FittedModel:
         """Train to the end."""
-        model = FittedModel("rafl", field=self.field)
         if (self.run / CHECKPOINT).exists():
             self._resume()
         else:
             self.group.wait()  # nobody looks for the checkpoint any more
-            first = self.group.agree(1e3 * mean_error(self.validate, model))
+            first = self.group.agree(1e3 * mean_error(self.validate, self.model))
             self.history.append({"epoch": 0, "loss": math.nan, "validation_mm": first, "learning_rate": 0.0})
             self._save(best=True)
         while self.history[-1]["epoch"] < self.settings.epochs and not self._stale():
             loss, failed = self._epoch()
             rate = float(self.optimiser.param_groups[0]["lr"])
             self.schedule.step()
-            error = self.group.agree(1e3 * mean_error(self.validate, model))
+            error = self.group.agree(1e3 * mean_error(self.validate, self.model))
             best = error < min(row["validation_mm"] for row in self.history)
             epoch = self.history[-1]["epoch"] + 1
             row = {"epoch": epoch, "loss": loss, "validation_mm": error, "learning_rate": rate}
@@ -246,7 +253,9 @@ class _Training:
     def _retreat(self) -> None:
         """To the best field so far, with half the learning rate and nothing in Adam's memory."""
         self.group.wait()  # what process 0 wrote is read
-        self.field.load_state_dict(field_of(self.run).state_dict())
+        best = load_model(self.run).field
+        assert best is not None
+        self.field.load_state_dict(best.state_dict())
         self.optimiser.state.clear()
         for group in self.optimiser.param_groups:
             group["lr"] *= 0.5
@@ -262,7 +271,7 @@ class _Training:
     def _save(self, best: bool) -> None:
         if self.group.first:
             if best:
-                save_model(self.run, FittedModel("rafl", field=self.field))
+                save_model(self.run, self.model)
             content: dict[str, object] = {
                 "format": FORMAT,
                 "method": "rafl",

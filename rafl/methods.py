@@ -5,7 +5,7 @@ from pathlib import Path
 
 from groundwork import InputError
 from rafl.dataset import Dataset
-from rafl.fit import Report, field_of, fit_residual_field, training_items
+from rafl.fit import Report, fit_residual_field, model_to_go_on_from, training_items
 from rafl.run import FittedModel, Settings
 from rafl.supervised import fit_supervised, one_mesh
 from rafl.sysid import SOUGHT, identify_material
@@ -29,7 +29,7 @@ def check_inputs(method: str, datasets: list[Dataset], start: Path | None) -> No
         start: run to go on from.
 
     Raises:
-        InputError: an unknown method, no training recordings, several meshes for srl, no field to go on from.
+        InputError: an unknown method, no training recordings, several meshes for srl, nothing to go on from.
     """
     if method not in METHODS:
         raise InputError(f"--method: expected {', '.join(METHODS)}, found {method!r}")
@@ -39,4 +39,4 @@ def check_inputs(method: str, datasets: list[Dataset], start: Path | None) -> No
     if start is not None:
         if method != "rafl":
             raise InputError(f"--from: expected method rafl, found {method}; leave it out")
-        field_of(start)
+        model_to_go_on_from(start)

@@ -21,12 +21,13 @@ FORMAT = "rafl-run/1"
 
 @dataclass(frozen=True)
 class FittedModel:
-    """What a fit leaves: a residual field, or identified material parameters.
+    """What a fit leaves: a residual field, identified material parameters, or both.
 
     Attributes:
         method: one of `rafl.methods.METHODS`.
         field: the residual acceleration field, for `rafl`.
-        material: identified values by their name in `rafl.parameters.Parameters`, for `sysid` and its kin.
+        material: identified values by their name in `rafl.parameters.Parameters`, for `sysid` and its kin, and for a
+            field that was trained on top of such.
         network: from the whole state to nodal forces, for `srl`.
     """
 
@@ -65,7 +66,7 @@ class Settings:
         batch: recordings an update.
         force_penalty: the paper's lambda_1 [m^2/N^2].
         warm_start: passes over the forces that follow the recordings step by step, before the first simulation.
-        start: run folder whose model training goes on from; empty for new weights.
+        start: run folder whose field or material training goes on from; empty for new weights and the datasets' own.
         by_sigma: whether markers count by their uncertainty.
     """
 
@@ -148,17 +149,17 @@ def load_model(run: Path) -> FittedModel:
         InputError: missing, damaged, or written by a newer version.
     """
     content = load_tensors(run / "model.pt", "a fitted model (written by rafl-fit)")
-    if "material" in content:
-        if not isinstance(content["material"], dict):
-            raise InputError(f"expected identified values by name in {run / 'model.pt'}, found a list; fit again")
-        return FittedModel(content["method"], material=content["material"])
+    material = content.get("material")
+    if not (material is None or isinstance(material, dict)):
+        raise InputError(f"expected identified values by name in {run / 'model.pt'}, found a list; fit again")
+    network = field = None
     if "network" in content:
         network = GlobalResidual(content["nodes"])
         network.load_state_dict(content["network"])
-        return FittedModel("srl", network=network)
-    field = ResidualField()
-    field.load_state_dict(content["field"])
-    return FittedModel("rafl", field=field)
+    if "field" in content:
+        field = ResidualField()
+        field.load_state_dict(content["field"])
+    return FittedModel(content["method"], field, material, network)
 
 
 def stale(errors: Sequence[float], patience: int) -> bool:

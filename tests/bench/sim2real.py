@@ -29,7 +29,6 @@ from rafl.dataset_file import read_dataset
 from rafl.evaluation import ORIGINAL, compare, error_table, latex_table, split_table
 from rafl.material import Material
 from rafl.mesh import HexMesh
-from rafl.methods import METHODS
 from rafl.run import load_model
 from rafl.synthetic import hung, let_go
 
@@ -47,7 +46,7 @@ class Effort:
         shapes: as many of the study's; all where None.
         recordings: numbers of recordings to train, to validate and to test with; all where None.
         frames: of each recording; as the study says where None.
-        epochs: by method.
+        epochs: by method; sysid+rafl: a field that corrects the material which sysid identified.
     """
 
     shapes: tuple[str, ...] | None
@@ -56,9 +55,12 @@ class Effort:
     epochs: dict[str, int]
 
 
-FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12})
+FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12, "sysid+rafl": 12})
 QUICK = Effort(
-    ("canonical", "thicker-scaled", "shorter"), (3, 1, 2), 50, {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8}
+    ("canonical", "thicker-scaled", "shorter"),
+    (3, 1, 2),
+    50,
+    {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8, "sysid+rafl": 8},
 )
 
 
@@ -149,7 +151,9 @@ class Study:
             if not resume:
                 shutil.rmtree(run, ignore_errors=True)
             dataset = self.out / shape / f"{shape}.h5"
-            command("rafl-fit", dataset, "--method", method, "--out", run, "--epochs", epochs, *resume)
+            base, _, own = method.rpartition("+")
+            start = ["--from", self.out / shape / base] if base else []
+            command("rafl-fit", dataset, "--method", own, "--out", run, "--epochs", epochs, *start, *resume)
             (run / DONE).touch()
 
     def tested(self, shape: str) -> tuple[pd.DataFrame, pd.DataFrame]:
@@ -203,7 +207,7 @@ def main() -> None:
         "mean marker error on the test recordings of the shape trained on [mm]", shown[[ORIGINAL, *study.effort.epochs]]
     )
     rows = []
-    for method in (method for method in METHODS if method in study.effort.epochs):
+    for method in study.effort.epochs:
         matrix = pd.DataFrame(
             {
                 shape: errors.set_index("method")["mean_mm"].reindex([f"{method}@{name}" for name in study.shapes])

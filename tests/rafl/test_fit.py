@@ -86,6 +86,18 @@ def test_system_identification_explains_the_recordings(dataset: Dataset, tmp_pat
     assert load_model(tmp_path).material == model.material
 
 
+def test_a_field_corrects_the_identified_material(dataset: Dataset, tmp_path: Path) -> None:
+    """Here the material explains all, so that a field on top of it starts where identification ended."""
+    identified = identify_material([dataset], replace(SETTINGS, method="sysid", epochs=30), tmp_path / "a", silent)
+    settings = replace(SETTINGS, epochs=2, frames=0, start=str(tmp_path / "a"), warm_start=3)
+    model = fit_residual_field([dataset], settings, tmp_path / "b", silent)
+    assert model.material == identified.material
+    held_out = [Recordings.of(dataset, ["d"])]
+    assert mean_error(held_out, load_model(tmp_path / "b")) < 0.01 * mean_error(held_out, FittedModel("original"))
+    again = fit_residual_field([dataset], replace(settings, start=str(tmp_path / "b")), tmp_path / "c", silent)
+    assert again.material == identified.material
+
+
 def test_an_interrupted_identification_goes_on(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
