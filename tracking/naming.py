@@ -14,6 +14,7 @@ from tracking.shape import Pattern, match_shape
 
 Array = NDArray[Any]
 
+FEWEST = 3  # dots that make a pattern
 NEAR = 0.4  # of the local spacing: how far a dot may be from where its neighbours put it
 BEHIND = 0.3  # of the spacing: a marker nearer than this to one before it in the picture is covered
 FAR = 0.05  # of a dot: what one that stands a spacing from its guessed place counts less
@@ -76,7 +77,8 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
     expected = camera.ideal(layout.positions[markers])
     best: tuple[float, Array] = (-np.inf, np.full(len(markers), -1))
     enough = ENOUGH * min(len(pixels), len(markers))
-    for shapes in _guesses(expected):
+    apart = len(markers) >= FEWEST and np.ptp(expected, axis=0).max() > 1.0
+    for shapes in _guesses(expected) if apart else []:
         for shape in shapes:
             found = match_shape(Pattern.of(shape), pixels, FAR)
             best = max(best, found, key=lambda pair: pair[0])
@@ -85,7 +87,7 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
         if best[0] > enough:
             break
     matched = np.flatnonzero(best[1] >= 0)
-    if len(matched) < 3:
+    if len(matched) < FEWEST:
         raise InputError(
             f"{what}: expected dots in the pattern of the specimen's markers, found {len(matched)} of "
             f"{len(markers)} that match; check --specimen, and that calib.yaml belongs to this set-up"

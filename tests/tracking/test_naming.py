@@ -106,8 +106,11 @@ def test_missing_and_false_dots(random: np.random.Generator) -> None:
 
 def test_another_pattern_is_refused(random: np.random.Generator) -> None:
     far_apart = np.array([[0.0, 0.0], [1200.0, 10.0], [600.0, 700.0], [10.0, 650.0]])
-    with pytest.raises(InputError, match="a video: expected dots in the pattern"):
-        name_by_layout(far_apart, LAYOUT, CAMERA, "a video")
+    alone = MarkerLayout(LAYOUT.names[:1], LAYOUT.positions[:1])
+    heap = MarkerLayout(LAYOUT.names[:4], LAYOUT.positions[[0, 0, 0, 0]])
+    for dots, layout in ((far_apart, LAYOUT), (filmed(), alone), (filmed(), heap)):
+        with pytest.raises(InputError, match="a video: expected dots in the pattern"):
+            name_by_layout(dots, layout, CAMERA, "a video")
 
 
 def test_rows_and_columns(random: np.random.Generator) -> None:
