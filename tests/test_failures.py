@@ -65,6 +65,7 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def test_killed_and_started_again(lab: Path) -> None:
     """Killed at several moments; what is left is whole, and the end is what it would have been."""
+    track(lab, "first")  # compiles
     program = [str(Path(sys.executable).parent / "rafl-track"), *command(lab)]
     for wait in (1.5, 2.2, 2.6, 3.0):
         process = subprocess.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
