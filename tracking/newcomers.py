@@ -81,7 +81,8 @@ class Newcomers:
             parameters: of their discs, (M, 12).
         """
         self.recent.append((number, image, place))
-        while len(self.recent) > max(min(KEPT, MOST_BYTES // image.nbytes), 1):
+        most = KEPT if self.candidates else EVERY  # fresh memory is slow
+        while len(self.recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
             self.recent.popleft()
         if number < self.due or seen.mean() < 0.5:
             return []
