@@ -90,7 +90,7 @@ def training_targets(dataset: Dataset, path: Path, most: int | None = None) -> t
     Args:
         dataset: with training recordings.
         path: keeps them; where it exists it is read.
-        most: how many markers, evenly spread, are followed; all unless given.
+        most: how many markers, drawn at random but always the same, are followed; all unless given.
 
     Raises:
         SimulationError: the recordings cannot be followed.

@@ -131,9 +131,10 @@ def _bent(places: Array, angles: Array) -> list[Array]:
                     steps = np.stack([np.cos(slope), np.sin(slope)], axis=1) * length / (len(u) - 1)
                     line = np.concatenate([[[0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
                     x, y, own = (np.interp(mine, u, values) for values in (*line.T, slope))
-                    in_it = (x - h * way * np.sin(own), y + h * way * np.cos(own))
+                    turning = (x - h * way * np.sin(own), y + h * way * np.cos(own))
+                    upright = (x, y + h * way)  # seen aslant, sections do not seem to turn
                     out_of_it = (x, h * way)
-                    for forth, side in (in_it, out_of_it) if angle > 0 and form[50] > 0.5 else (in_it,):
+                    for forth, side in (turning, upright, out_of_it):
                         shapes.append(middle + (end + way * forth)[:, None] * along + (way * side)[:, None] * across)
     return shapes
 

@@ -22,6 +22,7 @@ GATE = 0.36  # of a marker's spacing: how far from where its neighbours put it a
 STIFFNESS = 0.04  # of neighbours' own spread: how firmly local maps hold on to the expected one
 FAR = 0.12  # of a marker: what a dot one spacing from its expected place costs, where motion is known
 TURNS = np.radians([0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0])  # tried where the body is lost
+SEED_MARKERS, SEED_DOTS = 8, 5  # from how many markers, and how many dots of each, a match may begin
 ROUGH = 0.5  # of a marker: what a dot at the gate's edge costs
 
 
@@ -301,9 +302,14 @@ def match_shape(pattern: Pattern, dots: Array, far: float) -> tuple[float, NDArr
         dots: of a picture [px], (D, 2).
         far: what a dot one spacing from its place counts less.
     """
-    search = _Search.of(pattern, dots)
-    seeds = search.seeds(pattern.rest, np.zeros(len(pattern.rest)), np.inf)
-    match, score = search.grow(pattern.rest, pattern.rest, np.tile(np.eye(2), (len(pattern.rest), 1, 1)), far, seeds)
+    count = len(pattern.rest)
+    some = np.arange(0, count, max(count // SEED_MARKERS, 1))
+    tree, seeds = cKDTree(dots), []
+    for places in (pattern.rest, pattern.rest + dots.mean(axis=0) - pattern.rest.mean(axis=0)):
+        near = tree.query(places[some], min(SEED_DOTS, len(dots)))[1].reshape(len(some), -1)
+        seeds.append(np.stack([np.repeat(some, near.shape[1]), near.ravel()], axis=1))
+    linear = np.tile(np.eye(2), (count, 1, 1))
+    match, score = _Search.of(pattern, dots).grow(pattern.rest, pattern.rest, linear, far, np.concatenate(seeds))
     return score, match
 
 

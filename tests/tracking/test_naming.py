@@ -97,6 +97,19 @@ def test_far_bent_beams_get_their_names(name: str, slope_deg: float, lost: int) 
     assert name_by_layout(dots, layout, CAMERA, "a video") == seen.tolist()
 
 
+@pytest.mark.parametrize(("columns", "rows", "along_mm", "across_mm"), [(12, 4, 8, 4), (20, 5, 5, 3)])
+@pytest.mark.parametrize("slope_deg", [-70, -30, 20, 45, 75])
+def test_far_bent_sheets_of_many_dots_get_their_names(
+    columns: int, rows: int, along_mm: float, across_mm: float, slope_deg: float, random: np.random.Generator
+) -> None:
+    x, z = np.meshgrid(5.0 + along_mm * np.arange(columns), across_mm * np.arange(rows))
+    places = 1e-3 * np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    layout = MarkerLayout(tuple(f"m{k}" for k in range(len(places))), places)
+    seen = random.permutation(len(places))[4:]
+    dots = CAMERA.project(hanging(places[seen], np.radians(slope_deg)))
+    assert name_by_layout(dots, layout, CAMERA, "a video") == seen.tolist()
+
+
 def test_missing_and_false_dots(random: np.random.Generator) -> None:
     dots = filmed(bend=0.02)
     kept = np.delete(np.arange(16), [3, 12])
