@@ -1,6 +1,7 @@
 """Pictures of a deformed, dotted, lit specimen as an orthographic camera sees it."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import cv2
@@ -42,9 +43,17 @@ class Look:
 
 
 @njit(cache=True, nogil=True)
+def _wave(angle):  # type: ignore[no-untyped-def]
+    """A sine made of parabolas, 6 % off at most, which is no matter for a skin and much quicker."""
+    turn = angle / (2.0 * np.pi)
+    turn -= np.floor(turn + 0.5)
+    return 8.0 * turn * (1.0 - 2.0 * abs(turn))
+
+
+@njit(cache=True, nogil=True)
 def _texture(x, y, z):  # type: ignore[no-untyped-def]
     """A mottled skin, about -1 to 1, fixed to the body; x, y, z in mm."""
-    return 0.7 * np.sin(1.9 * x + 0.7 * y) * np.sin(1.3 * z - 1.1 * y) + 0.4 * np.sin(5.3 * x - 4.1 * z + 3.1 * y)
+    return 0.7 * _wave(1.9 * x + 0.7 * y) * _wave(1.3 * z - 1.1 * y) + 0.4 * _wave(5.3 * x - 4.1 * z + 3.1 * y)
 
 
 @njit(cache=True, nogil=True)
@@ -122,7 +131,7 @@ class Painter:
         """A picture (H, W) of the mesh at positions (samples, N, 3) [m] during the exposure."""
         surface = self.specimen.mesh.surface
         rest = 1e3 * self.specimen.mesh.vertices[surface]
-        touching = self._dots_of_quads(rest)
+        touching = self._dots_of_quads
         picture = np.zeros_like(self.backdrop)
         softness = 1e-3 * float(np.linalg.norm(self.camera.slopes(self.specimen.mesh.vertices.mean(0))[0]))
         # One place inside the pixel per instant smooths the outline; they average to its centre.
@@ -143,8 +152,10 @@ class Painter:
             picture += layer / len(positions)
         return develop(picture, self.look, random)
 
-    def _dots_of_quads(self, rest: Array) -> list[list[int]]:
-        """For each quad (S, 4, 3) [mm], which dots can reach into it on the same face."""
+    @cached_property
+    def _dots_of_quads(self) -> list[list[int]]:
+        """For each quad of the surface, which dots can reach into it on the same face."""
+        rest = 1e3 * self.specimen.mesh.vertices[self.specimen.mesh.surface]
         normal = np.cross(rest[:, 1] - rest[:, 0], rest[:, 3] - rest[:, 0])
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         reach = 1e3 * self.look.dot_radius + 0.5
@@ -188,7 +199,8 @@ def develop(picture: Array, look: Look, random: np.random.Generator) -> NDArray[
         picture = cv2.GaussianBlur(picture, (0, 0), look.blur)
     x, y = np.linspace(-1, 1, width), np.linspace(-1, 1, height)[:, None]
     picture = picture * (1.0 - 0.12 * (x - 0.3) ** 2 - 0.08 * y**2)
-    picture = picture + random.normal(0.0, look.noise, picture.shape) if look.noise > 0 else picture
+    if look.noise > 0:
+        picture = picture + look.noise * random.standard_normal(picture.shape, dtype=np.float32)
     return np.clip(np.rint(picture), 0, 255).astype(np.uint8)
 
 
