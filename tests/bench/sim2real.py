@@ -46,7 +46,7 @@ class Effort:
         shapes: as many of the study's; all where None.
         recordings: numbers of recordings to train, to validate and to test with; all where None.
         frames: of each recording; as the study says where None.
-        epochs: by method; sysid+rafl: a field that corrects the material which sysid identified.
+        epochs: by method.
     """
 
     shapes: tuple[str, ...] | None
@@ -55,12 +55,12 @@ class Effort:
     epochs: dict[str, int]
 
 
-FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12, "sysid+rafl": 12})
+FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12})
 QUICK = Effort(
     ("canonical", "thicker-scaled", "shorter"),
     (3, 1, 2),
     50,
-    {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8, "sysid+rafl": 8},
+    {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8},
 )
 
 
@@ -151,9 +151,7 @@ class Study:
             if not resume:
                 shutil.rmtree(run, ignore_errors=True)
             dataset = self.out / shape / f"{shape}.h5"
-            base, _, own = method.rpartition("+")
-            start = ["--from", self.out / shape / base] if base else []
-            command("rafl-fit", dataset, "--method", own, "--out", run, "--epochs", epochs, *start, *resume)
+            command("rafl-fit", dataset, "--method", method, "--out", run, "--epochs", epochs, *resume)
             (run / DONE).touch()
 
     def tested(self, shape: str) -> tuple[pd.DataFrame, pd.DataFrame]:
