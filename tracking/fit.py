@@ -27,6 +27,10 @@ QUALITY = 7  # converged; centre's variances by independent errors (2), by block
 OUTLYING = 0.12  # of the contrast: a pixel farther off than this shows something else than the dot
 STRANGE = 0.25  # of the contrast: a level this far from what the start expects
 NEAR = 0.03  # px: the next step would be a hundred times smaller
+CLOSE = 1.0  # px: a step so short leaves the normal matrix nearly as it was
+SWELLING = 0.3  # px: a step that widens the disc by less does neither change it
+SHRINKING = 0.4  # of one such step to the next, at most
+LITTLE = 1e-3  # of the normal matrix' diagonal: damping that changes neither steps nor variances to speak of
 WORTHLESS = 1.0  # of a pixel's mean squared residual: a gain that says nothing more about the disc
 LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edge does not describe any more
 BLOCK = 4  # px: errors closer than this are not taken to be independent
@@ -222,15 +226,16 @@ def _add_influence(first, count, w, pull, white, blocks):  # type: ignore[no-unt
 def _minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-def]
     """Levenberg and Marquardt's steps from p, which is filled with the result; False where they fail.
 
-    Ends within `NEAR` of the minimum; L then factors H there, or nearly.
+    H holds the normal equations at p. Ends within `NEAR` of the minimum; L then factors H there, or nearly.
     """
     n = PARAMETERS
     trial = p.copy()
     step = np.zeros(n)
     damping = 1e-3
     best = np.inf
-    for _ in range(40):
-        _normal_equations(trial, smeared, x0, y0, count, w, H)
+    for attempt in range(40):
+        if attempt > 0:
+            _normal_equations(trial, smeared, x0, y0, count, w, H)
         cost = H[n, n]
         if not cost < np.inf:
             return False
@@ -254,13 +259,57 @@ def _minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-de
             gain = np.inf
         trial[:] = p + step
         _keep_possible(trial, smeared)
-        if max(abs(step[0]), abs(step[1])) < NEAR and gain * count < WORTHLESS * best:
+        length = max(abs(step[0]), abs(step[1]))
+        if damping < LITTLE and length < NEAR and gain * count < WORTHLESS * best:
             p[:] = trial
-            if damping < 1e-4:
-                return True
-            _normal_equations(p, smeared, x0, y0, count, w, H)
-            return _factor(H, 0.0, L)
+            return True
+        swelling = max(abs(step[2]), abs(step[4])) / (p[2] * p[4] - p[3] * p[3])
+        close = damping < LITTLE and length < CLOSE and swelling < SWELLING
+        if close and _approach(trial, smeared, x0, y0, count, w, L, length, best):
+            p[:] = trial
+            return True
     return False
+
+
+@njit(**FAST)
+def _approach(p, smeared, x0, y0, count, w, L, length, best):  # type: ignore[no-untyped-def]
+    """Goes on from p with one factor of the normal matrix; False, p being spoilt, where that does not get near.
+
+    length: of the step that led to p; best: cost before it.
+    """
+    score = np.zeros(PARAMETERS)
+    step = np.zeros(PARAMETERS)
+    for _ in range(4):
+        squares = _score(p, smeared, x0, y0, count, w, score)
+        if not squares <= best * (1.0 + 1e-6):
+            return False
+        step[:] = score
+        _substitute(L, step)
+        gain = 0.0
+        for i in range(PARAMETERS):
+            gain += step[i] * score[i]
+            p[i] += step[i]
+        _keep_possible(p, smeared)
+        best, before = squares, length
+        length = max(abs(step[0]), abs(step[1]))
+        if length < NEAR and gain * count < WORTHLESS * best:
+            return True
+        if length > SHRINKING * before:
+            return False
+    return False
+
+
+@njit(**FAST)
+def _score(p, smeared, x0, y0, count, w, score):  # type: ignore[no-untyped-def]
+    """Fills score (12), J W r; returns the weighted squared residual."""
+    score[:] = 0.0
+    total = 0.0
+    for first in range(0, count, CHUNK):
+        some = min(CHUNK, count - first)
+        linearise(p, smeared, x0, y0, first, some, w)
+        squares, _ = _add_scores(first, some, w, score)
+        total += squares
+    return total
 
 
 @njit(**FAST)
@@ -284,7 +333,7 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
         count = choose_pixels(image, p, near, w)
         if count < 3 * n:
             return
-        strange = _distrust(p, smeared, x0, y0, count, w)
+        strange = _distrust(p, smeared, x0, y0, count, w, H)
         if not _minimise(p, smeared, x0, y0, count, w, H, L):
             return
         if not (left < p[0] < right and top < p[1] < bottom):
@@ -295,6 +344,7 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
     if np.sqrt(24.0 * spread) > LONG_SMEAR / np.sqrt(p[2] * p[4] - p[3] * p[3]):
         smeared = True
         smear(p)
+        _normal_equations(p, smeared, x0, y0, count, w, H)
         if not _minimise(p, smeared, x0, y0, count, w, H, L):
             return
         _normal_equations(p, smeared, x0, y0, count, w, H)
@@ -303,6 +353,7 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
     if strange or _outlying(count, w) > OUTLYING * abs(p[8]):
         for _ in range(6):
             change = _reweight(count, w)
+            _normal_equations(p, smeared, x0, y0, count, w, H)
             if not _minimise(p, smeared, x0, y0, count, w, H, L):
                 return
             if change < 0.1:
@@ -316,13 +367,15 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _distrust(p, smeared, x0, y0, count, w):  # type: ignore[no-untyped-def]
+def _distrust(p, smeared, x0, y0, count, w, H):  # type: ignore[no-untyped-def]
     """First weights: little where, away from the outline, a level is far from the start's; True if any is.
 
-    Otherwise a highlight beside the dot could pass for its blurred edge.
+    Otherwise a highlight beside the dot could pass for its blurred edge. Fills H as `_normal_equations` does.
     """
     scale = np.float32(STRANGE * abs(p[8]))
     strange = 0
+    w[WEIGHT : WEIGHT + count] = np.float32(1.0)
+    H[:] = 0.0
     for first in range(0, count, CHUNK):
         some = min(CHUNK, count - first)
         linearise(p, smeared, x0, y0, first, some, w)
@@ -333,11 +386,13 @@ def _distrust(p, smeared, x0, y0, count, w):  # type: ignore[no-untyped-def]
                 weight = np.float32(1.0) / (np.float32(1.0) + z * z * z * z)
             if weight < 0.3:
                 strange += 1
-            w[WEIGHT + first + k] = weight
+            w[SIZE + first + k] = weight
+        _add_products(first, some, w, H)
     if strange < 4:
-        for k in range(count):
-            w[WEIGHT + k] = np.float32(1.0)
-    return strange >= 4
+        return False
+    w[WEIGHT : WEIGHT + count] = w[SIZE : SIZE + count]
+    _normal_equations(p, smeared, x0, y0, count, w, H)
+    return True
 
 
 @njit(**FAST)

@@ -231,22 +231,22 @@ class Tracker:
         start = self.parameters.copy()
         start[:, :2] = expected
         dots = fit_dots(image, start)
-        away = np.linalg.norm(dots.centre - expected, axis=1)
+        away = np.hypot(*(dots.centre - expected).T)
         good = self.family.admits(dots) & (away < STRAY * self.pattern.spacing)
+        near = away < CALM * self.pattern.spacing
         change = dots.contrast / self.parameters[:, 8]
         good &= (change > 0.5) & (change < 2.0)
         seen = good & (self.missing == 0)
-        if not seen.any() or np.median(away[seen] / self.pattern.spacing[seen]) > CALM:
+        if not seen.any() or near[seen].mean() < 0.5:
             return None
         good &= ~self._doubled(dots.centre, good)
         return _only(dots, good)
 
     def _doubled(self, centre: Array, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Which markers share a dot with another."""
-        apart = np.linalg.norm(centre[:, None] - centre[None], axis=2)
-        apart[~good] = apart[:, ~good] = np.inf
-        np.fill_diagonal(apart, np.inf)
-        return apart.min(axis=1) < SAME_PLACE * self.family.radius
+        x, y = np.where(good[:, None], centre, np.nan).T
+        together = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < (SAME_PLACE * self.family.radius) ** 2
+        return together.sum(axis=1) > 1
 
     def _search(self, image: NDArray, expected: Array) -> Dots:
         """Every dot near the body, matched to the markers all at once."""
@@ -277,15 +277,16 @@ class Tracker:
         was = self.missing == 0
         both = seen & was
         if both.any():
-            for order in range(min(len(self.believed), ORDERS)):
-                gap = np.linalg.norm(dots.centre - self._extrapolated(order), axis=1)[both] / self.pattern.spacing[both]
-                now = float(np.sqrt((gap**2).mean()))
-                before = self.surprise[order]
-                self.surprise[order] = max(now, 0.7 * before) if np.isfinite(before) else now
+            orders = min(len(self.believed), ORDERS)
+            missed = [dots.centre - self._extrapolated(order) for order in range(orders)]
+            square = np.square(missed).sum(axis=2) / self.pattern.spacing**2
+            now, before = np.sqrt(square[:, both].mean(axis=1)), self.surprise[:orders]
+            self.surprise[:orders] = np.where(np.isfinite(before), np.maximum(now, 0.7 * before), now)
         else:
             self.surprise[:] = np.inf
-        place = np.where(seen[:, None], dots.centre, self._expected())
-        if seen.any():
+        place = dots.centre
+        if not seen.all():
+            place = np.where(seen[:, None], place, self._expected())
             place = self.pattern.carried(place, seen)
         self._remember(place)
         self.missing = np.where(seen, 0, self.missing + 1)

@@ -105,9 +105,10 @@ class Newcomers:
         region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         spots = find_spots(image, self.family.radius, self.family.contrast, region)
         away = np.linalg.norm(spots[:, None] - place[None], axis=2).min(axis=1, initial=np.inf)
-        starts = _starts(spots[away > 0.5 * FREE * spacing], parameters)
-        if not len(starts):
+        strange = spots[away > 0.5 * FREE * spacing]
+        if not len(strange):
             return np.empty((0, 2))
+        starts = _starts(strange, parameters)
         dots = fit_dots(image, np.concatenate([starts, _moved(parameters, place)]))[np.arange(len(starts))]
         return apart(dots[self._admitted(dots)], SAME_PLACE * self.family.radius).centre
 

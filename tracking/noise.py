@@ -39,12 +39,13 @@ def with_shared_errors(pixel: Array, sigma: Array) -> Array:
     excess = np.zeros((len(markers), 2))
     for k in range(len(markers)):
         others = np.delete(path, k, axis=1).reshape(len(frames), -1)
-        left, size, _ = np.linalg.svd(others, full_matrices=False)
-        basis = left[:, :count]
+        square, modes = np.linalg.eigh(others.T @ others)  # ascending
+        size = np.sqrt(np.maximum(square[-count:], 1e-12 * square[-1]))
+        basis = others @ modes[:, -count:] / size
         gain = basis.T @ path[:, k]
         missed = ((path[:, k] - basis @ gain) ** 2).sum(axis=0) / (len(frames) - count)
         # The modes carry the others' errors too.
-        carried = 1.0 + (gain**2 / size[:count, None] ** 2).sum(axis=0)
+        carried = 1.0 + (gain**2 / size[:, None] ** 2).sum(axis=0)
         own = (sigma[np.ix_(frames, markers[k : k + 1])][:, 0] ** 2).mean(axis=0)
         beyond = missed / carried - own
         excess[k] = np.where(beyond > TELLING * own, beyond, 0.0)
