@@ -26,7 +26,7 @@ from capture.render import Look, Painter
 from capture.specimen import Specimen, read_specimen
 from groundwork import progress, write_text
 from rafl.dataset_file import read_dataset
-from rafl.evaluation import ORIGINAL, compare, error_table, latex_table, split_table
+from rafl.evaluation import ORIGINAL, compare, latex_table, split_table
 from rafl.material import Material
 from rafl.mesh import HexMesh
 from rafl.run import load_model
@@ -154,22 +154,22 @@ class Study:
             command("rafl-fit", dataset, "--method", method, "--out", run, "--epochs", epochs, *resume)
             (run / DONE).touch()
 
-    def tested(self, shape: str) -> tuple[pd.DataFrame, pd.DataFrame]:
-        """Test errors of all models on one shape, by method and the shape trained on; its own by split."""
-        table, own = (self.out / shape / name for name in ("errors.csv", "own.csv"))
-        if not (table.exists() and own.exists()):
+    def tested(self, shape: str) -> pd.DataFrame:
+        """Test errors of all models on one shape, by method and the shape trained on."""
+        table = self.out / shape / "tested.csv"
+        if not table.exists():
             print(f"{shape}: testing", flush=True)
             dataset = read_dataset(self.out / shape / f"{shape}.h5")
+            unseen = {name: dataset.trajectories[name] for name in dataset.split("test")}
+            dataset = replace(dataset, trajectories=unseen)
             nodes, models = len(dataset.simulator.mesh.vertices), {}
             for trained in self.shapes:
                 for method in self.effort.epochs:
                     model = load_model(self.out / trained / method)
                     if model.network is None or model.network.nodes == nodes:
                         models[f"{method}@{trained}"] = model
-            comparisons = compare(dataset, models)
-            write_text(table, error_table(comparisons).to_csv(index=False))
-            write_text(own, split_table(comparisons).to_csv(index=False))
-        return pd.read_csv(table), pd.read_csv(own)
+            write_text(table, split_table(compare(dataset, models)).to_csv(index=False))
+        return pd.read_csv(table)
 
 
 def show(title: str, table: pd.DataFrame) -> None:
@@ -191,7 +191,7 @@ def main() -> None:
     for shape in study.shapes:
         study.record(shape)
         study.fit(shape)
-    tested = {shape: study.tested(shape)[1].query("split == 'test'") for shape in study.shapes}
+    tested = {shape: study.tested(shape) for shape in study.shapes}
     own = []
     for shape, errors in tested.items():
         chosen = errors[errors["method"].isin([ORIGINAL, *(f"{method}@{shape}" for method in study.effort.epochs)])]
