@@ -80,15 +80,17 @@ def _draw_quads(image, corners, rest, shade, first, dots, radius, softness, skin
             for column in range(left, right):
                 u = column + shift[0] - ax
                 v = row + shift[1] - ay
-                for _ in range(3 if column == left else 2):  # invert the bilinear map, from the pixel before
+                for _ in range(4):  # invert the bilinear map, from the pixel before
                     gu = s * bx + t * dx + s * t * cx - u
                     gv = s * by + t * dy + s * t * cy - v
+                    if abs(gu) + abs(gv) < 1e-3:
+                        break
                     su, tu = bx + t * cx, dx + s * cx
                     sv, tv = by + t * cy, dy + s * cy
                     inverse = 1.0 / (su * tv - tu * sv + 1e-300)
                     s -= (tv * gu - tu * gv) * inverse
                     t -= (su * gv - sv * gu) * inverse
-                if not (-1e-9 <= s <= 1.0 + 1e-9 and -1e-9 <= t <= 1.0 + 1e-9):
+                if not (-1e-4 <= s <= 1.0001 and -1e-4 <= t <= 1.0001):  # what the inversion may be off by
                     continue
                 w0, w1, w2, w3 = (1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t
                 px = w0 * rest[q, 0, 0] + w1 * rest[q, 1, 0] + w2 * rest[q, 2, 0] + w3 * rest[q, 3, 0]
