@@ -40,6 +40,7 @@ class Dots:
         radius: geometric mean of the semi-axes [px], (D).
         flattening: ratio of the axes, 1 for a circle, (D).
         contrast: of the dot against its surroundings, negative for dark dots [grey levels], (D).
+        leverage: what a grey level of independent noise in every pixel moves the centre by [px], (D, 2).
         residual: root mean square misfit of the disc, as a share of the contrast, (D).
         used: share of the pixels that the fit trusted, (D).
     """
@@ -50,6 +51,7 @@ class Dots:
     radius: Array
     flattening: Array
     contrast: Array
+    leverage: Array
     residual: Array
     used: Array
 
@@ -64,7 +66,7 @@ class Dots:
         """As many dots that are not there."""
         nan = np.full(count, np.nan)
         pair = np.full((count, 2), np.nan)
-        return cls(pair, pair.copy(), np.full((count, PARAMETERS), np.nan), nan, nan, nan, nan, nan)
+        return cls(pair, pair.copy(), np.full((count, PARAMETERS), np.nan), nan, nan, nan, pair.copy(), nan, nan)
 
 
 @njit(cache=True, nogil=True)
@@ -110,6 +112,7 @@ def fit_dots(image: NDArray, start: Array) -> Dots:
             radius=np.where(good, determinant, np.nan) ** -0.5,
             flattening=np.where(good, (mean - spread) / (mean + spread), 0.0),
             contrast=fitted[:, 8],
+            leverage=np.sqrt(white / quality[:, 5:6]),
             residual=np.sqrt(quality[:, 5]) / np.abs(fitted[:, 8]),
             used=quality[:, 6],
         )

@@ -14,9 +14,9 @@ from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, eight_bits, find_spots, fit_dots, start_of
 from tracking.family import Family, find_family
 from tracking.newcomers import Newcomer, Newcomers
-from tracking.noise import with_shared_errors
+from tracking.noise import with_coding_errors, with_shared_errors
 from tracking.shape import Pattern, carry, recognise
-from tracking.video import Video
+from tracking.video import Frame, Video
 
 Array = NDArray[Any]
 
@@ -67,7 +67,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
         InputError: fewer than three markers, or a video that cannot be decoded.
     """
     times: list[float] = []
-    seen: list[tuple[Array, Array]] = []  # pixels and sigma, of as many markers as were known then
+    seen: list[Sight] = []  # of as many markers as were known then
     late: list[Newcomer] = []
     damaged: list[bool] = []
     most = 0
@@ -77,21 +77,21 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     for frame in reading:
         times.append(frame.time)
         damaged.append(frame.picture is None)
-        pair = NOTHING, NOTHING
+        sight = Sight(NOTHING, NOTHING, NOTHING)
         if frame.picture is not None and tracker is None:
             found = find_family(frame.picture)
             most = max(most, 0 if found is None else len(found[1]))
             if found is not None and len(found[1]) >= FEWEST_MARKERS:
                 tracker = Tracker(*found)
-                pair = found[1].centre, found[1].sigma
+                sight = Sight.of(found[1], frame)
         elif frame.picture is not None and tracker is not None:
-            pair = tracker.advance(frame.picture)
+            sight = Sight.of(tracker.advance(frame.picture), frame)
             late += tracker.look_out(len(times) - 1, frame.picture)
         elif tracker is not None:
             tracker.pass_over()
         if frame.picture is not None and tracker is not None:
-            album.consider(len(times) - 1, frame.picture, pair[1])
-        seen.append(pair)
+            album.consider(len(times) - 1, frame.picture, sight.sigma)
+        seen.append(sight)
         tick()
     if all(damaged):
         raise InputError(f"expected frames in {video.path}, found none that decode; copy it again from the camera")
@@ -100,22 +100,45 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
             f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in a frame, found {most} at most; "
             "check that dots of 3 to 32 px radius contrast with the skin"
         )
-    paths, fitted = _whole(seen, late, len(tracker.pattern.rest))
+    paths, fitted, coded = _whole(seen, late, len(tracker.pattern.rest))
+    sigma = with_coding_errors(paths, with_shared_errors(paths, fitted), coded)
     return PixelTracks(
-        np.array(times), paths, with_shared_errors(paths, fitted), tracker.pattern.rest, len(late), np.array(damaged),
+        np.array(times), paths, sigma, tracker.pattern.rest, len(late), np.array(damaged),
         album.pictures(), tuple(reading.notes),
     )  # fmt: skip
 
 
-def _whole(seen: list[tuple[Array, Array]], late: list[Newcomer], count: int) -> tuple[Array, Array]:
-    """Pixels and sigma (T, D, 2) of all markers, NaN where not seen; the last are the late ones."""
-    paths, fitted = np.full((2, len(seen), count, 2), np.nan)
-    for frame, (pixel, sigma) in enumerate(seen):
-        paths[frame, : len(pixel)], fitted[frame, : len(pixel)] = pixel, sigma
+@dataclass(frozen=True)
+class Sight:
+    """The markers in one picture.
+
+    Attributes:
+        pixel: (D, 2), NaN where not seen.
+        sigma: from the fits [px], (D, 2), NaN where not seen.
+        coded: the centre's error if the video's coding left independent errors of one step in each pixel [px], (D, 2).
+    """
+
+    pixel: Array
+    sigma: Array
+    coded: Array
+
+    @classmethod
+    def of(cls, dots: Dots, frame: Frame) -> "Sight":
+        """Those of a frame; dots without a sigma are not seen."""
+        pixel = np.where(np.isfinite(dots.sigma), dots.centre, np.nan)
+        return cls(pixel, dots.sigma, dots.leverage * frame.step_at(pixel)[:, None])
+
+
+def _whole(seen: list[Sight], late: list[Newcomer], count: int) -> tuple[Array, Array, Array]:
+    """Pixels, sigma and coding errors (T, D, 2) of all markers, NaN where not seen; the last are the late ones."""
+    paths, fitted, coded = np.full((3, len(seen), count, 2), np.nan)
+    for frame, sight in enumerate(seen):
+        known = len(sight.pixel)
+        paths[frame, :known], fitted[frame, :known], coded[frame, :known] = sight.pixel, sight.sigma, sight.coded
     for column, newcomer in enumerate(late, start=count - len(late)):
         for frame, (pixel, sigma) in newcomer.seen.items():
             paths[frame, column], fitted[frame, column] = pixel, sigma
-    return paths, fitted
+    return paths, fitted, coded
 
 
 class _Album:
@@ -161,8 +184,8 @@ class Tracker:
         self.searched = 0  # frames since the last search
         self.newcomers = Newcomers(family)
 
-    def advance(self, image: NDArray) -> tuple[Array, Array]:
-        """Positions and sigma (D, 2) in the next picture, NaN where a marker is not seen."""
+    def advance(self, image: NDArray) -> Dots:
+        """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
         expected = self._expected()
         dots = None
         if self.surprise.min() < CALM:
@@ -175,7 +198,7 @@ class Tracker:
             dots = found if better or dots is None else dots
             self.searched = 0
         self._learn(dots)
-        return np.where(np.isfinite(dots.sigma), dots.centre, np.nan), dots.sigma
+        return dots
 
     def pass_over(self) -> None:
         """A frame that shows nothing."""

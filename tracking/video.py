@@ -12,6 +12,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+from av.sidedata.sidedata import Type as SideData
 from numpy.typing import NDArray
 
 from groundwork import InputError
@@ -23,8 +24,10 @@ AHEAD = 6  # pictures decoded before they are asked for
 av.logging.set_level(av.logging.ERROR)
 logging.getLogger("libav").addHandler(logging.NullHandler())
 logging.getLogger("libav").propagate = False
-# What makes FFmpeg's decoders report damage instead of painting over it.
-STRICT = {"err_detect": "crccheck+bitstream+buffer+explode"}
+# What makes FFmpeg's decoders report damage instead of painting over it, and how coarsely a picture was coded.
+STRICT = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data": "venc_params"}
+MACROBLOCK = 16  # px: side of the squares that H.264 codes with one step
+H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
 
 
 @dataclass(frozen=True)
@@ -35,10 +38,21 @@ class Frame:
         time: since the first frame [s]; NaN where unknown.
         picture: grey levels of 0 to 255 (H, W), uint8, or float32 where the video has more than 8 bits;
             None where the frame is damaged.
+        steps: by which H.264 rounded the changes in each square of 16 px [grey levels], (H / 16, W / 16); None where
+            the decoder does not say.
     """
 
     time: float
     picture: NDArray | None
+    steps: NDArray | None = None
+
+    def step_at(self, places: NDArray) -> NDArray:
+        """The steps at places [px], (D, 2); 0 where they are not known, (D)."""
+        if self.steps is None:
+            return np.zeros(len(places))
+        last = np.array(self.steps.shape[::-1]) - 1
+        column, row = np.clip(np.nan_to_num(places) / MACROBLOCK, 0, last).astype(int).T
+        return self.steps[row, column]
 
 
 @dataclass
@@ -232,7 +246,7 @@ def _file_frames(video: Video, notes: list[str]) -> Iterator[Frame]:
                     time = np.nan if frame.pts is None else slots.time(frame.pts)
                     picture = None if spoilt else _grey(frame)
                     shown.append(time)
-                    yield Frame(time, picture)
+                    yield Frame(time, picture, None if spoilt else _steps(frame))
                     number += 1
             if number:
                 missing = list(slots.up_to(None))
@@ -314,6 +328,30 @@ def _grey(frame: "av.VideoFrame") -> NDArray:
         picture = frame.to_ndarray(format="gray")
     turns = round(frame.rotation / 90.0) % 4
     return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
+
+
+def _steps(frame: "av.VideoFrame") -> NDArray | None:
+    """The steps by which an H.264 picture of 8 bits was rounded, turned as it is to be shown."""
+    if frame.format.components[0].bits != 8:
+        return None
+    rows, columns = (-(-side // MACROBLOCK) for side in (frame.height, frame.width))
+    for data in frame.side_data:
+        if data.type != SideData.VIDEO_ENC_PARAMS:
+            continue
+        # FFmpeg's AVVideoEncParams: count, offset and size of the blocks, kind, quantiser; each block ends in its own.
+        head = np.frombuffer(data, np.int32, 8)
+        count, offset, size, kind, quantiser = (int(head[k]) for k in (0, 2, 4, 6, 7))
+        if kind != H264_PARAMETERS or count != rows * columns or size % 4:
+            continue
+        blocks = np.frombuffer(data, np.int32, count * size // 4, offset).reshape(rows, columns, -1)
+        steps = 0.625 * 2.0 ** ((quantiser + blocks[..., 4]) / 6.0)
+        turns = round(frame.rotation / 90.0) % 4
+        if turns:
+            whole = np.kron(steps, np.ones((MACROBLOCK, MACROBLOCK)))[: frame.height, : frame.width]
+            half = MACROBLOCK // 2
+            steps = np.rot90(whole, turns)[half::MACROBLOCK, half::MACROBLOCK]
+        return steps
+    return None
 
 
 def _ahead(source: Iterator[Frame]) -> Iterator[Frame]:

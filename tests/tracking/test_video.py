@@ -184,6 +184,35 @@ def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path) -> None:
     assert np.corrcoef(picture.ravel(), clockwise.ravel())[0, 1] > 0.99
 
 
+def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
+    """H.264 whose macroblocks differ; at a fixed quantiser of 30, whose step is 20 levels; other codecs say none."""
+    path = tmp_path / "a.mp4"
+    write_video(path, "libx264", "yuv420p", options={"crf": "25", "aq-mode": "1", "aq-strength": "2"})
+    plain = [frame.steps for frame in open_video(path).read()]
+    content = bytearray(path.read_bytes())
+    matrix = content.index(b"tkhd") + 44
+    one = 0x10000
+    content[matrix : matrix + 36] = struct.pack(">9i", 0, one, 0, -one, 0, 0, 64 * one, 0, 0x40000000)
+    path.write_bytes(content)
+    turned = list(open_video(path).read())
+    for steps, frame in zip(plain, turned, strict=True):
+        assert steps is not None
+        assert steps.shape == (4, 6)
+        np.testing.assert_array_equal(frame.steps, np.rot90(steps, -1))
+    assert len(np.unique(np.stack([frame.steps for frame in turned]))) > 1
+    corners = np.array([[0.0, 0.0], [63.4, 0.0], [63.4, 95.4], [np.nan, np.nan]])
+    first = np.rot90(plain[0], -1)
+    np.testing.assert_array_equal(turned[0].step_at(corners)[:3], [first[0, 0], first[0, 3], first[5, 3]])
+
+    write_video(path, "libx264", "yuv420p", options={"qp": "30", "bf": "0"})
+    last = list(open_video(path).read())[-1]
+    np.testing.assert_allclose(last.steps, 20.0)
+    write_video(path.with_suffix(".avi"), "mjpeg", "yuvj420p")
+    frame = next(iter(open_video(path.with_suffix(".avi")).read()))
+    assert frame.steps is None
+    np.testing.assert_array_equal(frame.step_at(corners), 0.0)
+
+
 def test_sixteen_bit_pictures(tmp_path: Path) -> None:
     """Twelve bits in a 16-bit PNG."""
     folder = tmp_path / "run"
