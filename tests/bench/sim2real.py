@@ -25,11 +25,13 @@ from capture.motion import Motion
 from capture.render import Look, Painter
 from capture.specimen import Specimen, read_specimen
 from groundwork import progress, write_text
+from rafl.dataset import Dataset
 from rafl.dataset_file import read_dataset
+from rafl.errors import SimulationError
 from rafl.evaluation import ORIGINAL, compare, latex_table, split_table
 from rafl.material import Material
 from rafl.mesh import HexMesh
-from rafl.run import load_model
+from rafl.run import FittedModel, load_model
 from rafl.synthetic import hung, let_go
 
 DATASETS = Path(__file__).parents[2] / "datasets"
@@ -81,6 +83,11 @@ class Study:
 
     def specimen(self, shape: str) -> Path:
         return DATASETS / "specimens" / f"{shape}.yaml"
+
+    def methods(self, shape: str) -> dict[str, int]:
+        """Epochs by method; supervised learning, which is tied to a mesh, where the mesh is the first shape's too."""
+        nodes = [len(read_specimen(self.specimen(each)).mesh.vertices) for each in (shape, self.shapes[0])]
+        return {method: n for method, n in self.effort.epochs.items() if method != "srl" or nodes[0] == nodes[1]}
 
     def lab(self, shape: str) -> Specimen:
         """The specimen as the lab has it."""
@@ -144,8 +151,8 @@ class Study:
         )  # fmt: skip
 
     def fit(self, shape: str) -> None:
-        """Every method."""
-        for method, epochs in self.effort.epochs.items():
+        """Every method that applies."""
+        for method, epochs in self.methods(shape).items():
             run = self.out / shape / method
             if (run / DONE).exists():
                 continue
@@ -154,36 +161,40 @@ class Study:
             if not resume:
                 shutil.rmtree(run, ignore_errors=True)
             dataset = self.out / shape / f"{shape}.h5"
-            command(
-                "rafl-fit",
-                dataset,
-                "--method",
-                method,
-                "--out",
-                run,
-                "--epochs",
-                epochs,
-                *OPTIONS.get(method, []),
-                *resume,
-            )
+            options = ["--method", method, "--epochs", epochs, *OPTIONS.get(method, []), *resume]
+            command("rafl-fit", dataset, "--out", run, *options)
             (run / DONE).touch()
 
     def tested(self, shape: str) -> pd.DataFrame:
         """Test errors of all models on one shape, by method and the shape trained on."""
-        table = self.out / shape / "tested.csv"
-        if not table.exists():
-            print(f"{shape}: testing", flush=True)
-            dataset = read_dataset(self.out / shape / f"{shape}.h5")
-            unseen = {name: dataset.trajectories[name] for name in dataset.split("test")}
-            dataset = replace(dataset, trajectories=unseen)
-            nodes, models = len(dataset.simulator.mesh.vertices), {}
-            for trained in self.shapes:
-                for method in self.effort.epochs:
+        tables = []
+        for trained in self.shapes:
+            table = self.out / shape / "tested" / f"{trained}.csv"
+            if not table.exists():
+                print(f"{shape}: testing what was trained on {trained}", flush=True)
+                dataset = read_dataset(self.out / shape / f"{shape}.h5")
+                unseen = {name: dataset.trajectories[name] for name in dataset.split("test")}
+                nodes, models = len(dataset.simulator.mesh.vertices), {}
+                for method in self.methods(trained):
                     model = load_model(self.out / trained / method)
                     if model.network is None or model.network.nodes == nodes:
                         models[f"{method}@{trained}"] = model
-            write_text(table, split_table(compare(dataset, models)).to_csv(index=False))
-        return pd.read_csv(table)
+                errors = test_errors(replace(dataset, trajectories=unseen), models)
+                write_text(table, errors.to_csv(index=False))
+            tables.append(pd.read_csv(table))
+        return pd.concat(tables).drop_duplicates("method")
+
+
+def test_errors(dataset: Dataset, models: dict[str, FittedModel]) -> pd.DataFrame:
+    """Errors by method; infinite where a model lets a simulation fail."""
+    try:
+        return split_table(compare(dataset, models))
+    except SimulationError as error:
+        if len(models) > 1:
+            return pd.concat([test_errors(dataset, {name: model}) for name, model in models.items()])
+        print(f"{dataset.name}, {next(iter(models))}: {error}")
+        failed = {"dataset": dataset.name, "split": "test", "method": next(iter(models)), "mean_mm": np.inf}
+        return pd.concat([split_table(compare(dataset, {})), pd.DataFrame([failed])])
 
 
 def show(title: str, table: pd.DataFrame) -> None:
@@ -215,6 +226,7 @@ def main() -> None:
     write_text(results / "sim2real.tex", latex_table(table))
     value = table["mean_mm"].map("{:.3f}".format) + " +- " + table["std_mm"].map("{:.3f}".format)
     shown = table.assign(error=value).pivot(index="dataset", columns="method", values="error").loc[study.shapes]
+    shown = shown.fillna("N/A")
     show(
         "mean marker error on the test recordings of the shape trained on [mm]", shown[[ORIGINAL, *study.effort.epochs]]
     )
@@ -229,10 +241,14 @@ def main() -> None:
         original = pd.Series(
             {shape: errors.set_index("method")["mean_mm"][ORIGINAL] for shape, errors in tested.items()}
         )
-        apart = ~np.eye(len(matrix), dtype=bool)
-        worse = int((matrix.gt(original, axis="columns") & apart).to_numpy().sum())
+        matrix = matrix.dropna(how="all").dropna(axis="columns", how="all")
+        apart = matrix.index.to_numpy()[:, None] != matrix.columns.to_numpy()
+        worse = int((matrix.gt(original[matrix.columns], axis="columns") & apart).to_numpy().sum())
         tried = int((matrix.notna() & apart).to_numpy().sum())
-        show(f"{method}: trained on a row's shape, tested on a column's [mm]", matrix.map("{:.3f}".format))
+        show(
+            f"{method}: trained on a row's shape, tested on a column's [mm]",
+            matrix.map("{:.3f}".format).replace("nan", "N/A"),
+        )
         print(f"{method}: negative transfer in {worse} of {tried} pairs of different shapes")
         rows.append(matrix.rename_axis("trained_on").reset_index().assign(method=method))
     write_text(results / "sim2real-transfer.csv", pd.concat(rows).to_csv(index=False, float_format="%.4f"))
