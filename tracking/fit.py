@@ -27,8 +27,9 @@ QUALITY = 7  # converged; centre's variances by independent errors (2), by block
 OUTLYING = 0.12  # of the contrast: a pixel farther off than this shows something else than the dot
 STRANGE = 0.25  # of the contrast: a level this far from what the start expects
 NEAR = 0.03  # px: the next step would be a hundred times smaller
-CLOSE = 1.0  # px: a step so short leaves the normal matrix nearly as it was
-SWELLING = 0.3  # px: a step that widens the disc by less does neither change it
+# Steps that leave the normal matrix nearly as it was: of the centre and of the radius [px], and the share by which the
+# contrast and the edge's variance may change.
+CLOSE, SWELLING, CHANGE = 1.0, 0.3, 0.05
 SHRINKING = 0.4  # of one such step to the next, at most
 LITTLE = 1e-3  # of the normal matrix' diagonal: damping that changes neither steps nor variances to speak of
 WORTHLESS = 1.0  # of a pixel's mean squared residual: a gain that says nothing more about the disc
@@ -263,12 +264,18 @@ def _minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-de
         if damping < LITTLE and length < NEAR and gain * count < WORTHLESS * best:
             p[:] = trial
             return True
-        swelling = max(abs(step[2]), abs(step[4])) / (p[2] * p[4] - p[3] * p[3])
-        close = damping < LITTLE and length < CLOSE and swelling < SWELLING
-        if close and _approach(trial, smeared, x0, y0, count, w, L, length, best):
+        if damping < LITTLE and _is_close(p, step) and _approach(trial, smeared, x0, y0, count, w, L, length, best):
             p[:] = trial
             return True
     return False
+
+
+@njit(**FAST)
+def _is_close(p, step):  # type: ignore[no-untyped-def]
+    """Whether a step from p leaves the normal matrix nearly as it was."""
+    swelling = max(abs(step[2]), abs(step[4])) / (p[2] * p[4] - p[3] * p[3])
+    change = max(abs(step[8] / p[8]), 0.5 * (abs(step[5]) + abs(step[7])) / (p[5] + p[7]))
+    return max(abs(step[0]), abs(step[1])) < CLOSE and swelling < SWELLING and change < CHANGE
 
 
 @njit(**FAST)
