@@ -59,4 +59,4 @@ def test_from_a_filmed_specimen_to_a_fitted_model(specimen_file: Path, run: Run,
     assert len(errors) == 9
     page = (tmp_path / "result/report.html").read_text()
     assert page.count("<img") == 6  # errors, markers, bodies and forces
-    assert "http" not in page.replace("data:image/png;base64", "")
+    assert "http" not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", page)  # where it may stand by chance
