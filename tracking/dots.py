@@ -102,7 +102,8 @@ def fit_dots(image: NDArray, start: Array) -> Dots:
     mean = 0.5 * (fitted[:, 2] + fitted[:, 4])
     spread = np.sqrt(np.maximum(mean**2 - determinant, 0.0))
     good = (quality[:, 0] > 0) & (determinant > 0) & (mean > 0)
-    white, shared = quality[:, 1:3], quality[:, 3:5]
+    leverage, shared = np.sqrt(quality[:, 1:3]), quality[:, 3:5]
+    white = leverage**2 * quality[:, 5:6]
     variance = np.where(shared.sum(1, keepdims=True) > SHARED_NOISE * white.sum(1, keepdims=True), shared, white)
     with np.errstate(divide="ignore", invalid="ignore"):
         return Dots(
@@ -112,7 +113,7 @@ def fit_dots(image: NDArray, start: Array) -> Dots:
             radius=np.where(good, determinant, np.nan) ** -0.5,
             flattening=np.where(good, (mean - spread) / (mean + spread), 0.0),
             contrast=fitted[:, 8],
-            leverage=np.sqrt(white / quality[:, 5:6]),
+            leverage=leverage,
             residual=np.sqrt(quality[:, 5]) / np.abs(fitted[:, 8]),
             used=quality[:, 6],
         )

@@ -154,8 +154,12 @@ def _quarter_turns(container: "av.container.InputContainer", stream: "av.video.s
         except av.FFmpegError:
             continue
         for frame in frames:
-            return round(frame.rotation / 90.0) % 4
+            return _turns(frame)
     return 0
+
+
+def _turns(frame: "av.VideoFrame") -> int:
+    return round(frame.rotation / 90.0) % 4
 
 
 def _read_picture(path: Path) -> NDArray | None:
@@ -326,7 +330,7 @@ def _grey(frame: "av.VideoFrame") -> NDArray:
         picture = _scaled(frame.to_ndarray(format="gray16le"), 16)
     else:
         picture = frame.to_ndarray(format="gray")
-    turns = round(frame.rotation / 90.0) % 4
+    turns = _turns(frame)
     return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
 
 
@@ -345,8 +349,7 @@ def _steps(frame: "av.VideoFrame") -> NDArray | None:
             continue
         blocks = np.frombuffer(data, np.int32, count * size // 4, offset).reshape(rows, columns, -1)
         steps = 0.625 * 2.0 ** ((quantiser + blocks[..., 4]) / 6.0)
-        turns = round(frame.rotation / 90.0) % 4
-        if turns:
+        if turns := _turns(frame):
             whole = np.kron(steps, np.ones((MACROBLOCK, MACROBLOCK)))[: frame.height, : frame.width]
             half = MACROBLOCK // 2
             steps = np.rot90(whole, turns)[half::MACROBLOCK, half::MACROBLOCK]

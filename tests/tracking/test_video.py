@@ -167,15 +167,20 @@ def test_a_false_rate_is_noted(tmp_path: Path) -> None:
     assert any("announces 40 frames and holds 12" in note for note in reading.notes)
 
 
-def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path) -> None:
-    """As telephones write it: the pictures lie on their side, the file's display matrix says a quarter turn."""
-    path = tmp_path / "a.mp4"
-    write_video(path, "libx264", "yuv420p", options={"crf": "4"})
+def lay_on_its_side(path: Path) -> None:
+    """Let a video's display matrix ask for a quarter turn clockwise."""
     content = bytearray(path.read_bytes())
     matrix = content.index(b"tkhd") + 44  # after version, times, number, duration, layer and volume
     one = 0x10000
     content[matrix : matrix + 36] = struct.pack(">9i", 0, one, 0, -one, 0, 0, 64 * one, 0, 0x40000000)
     path.write_bytes(content)
+
+
+def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path) -> None:
+    """As telephones write it: the pictures lie on their side, the file's display matrix says a quarter turn."""
+    path = tmp_path / "a.mp4"
+    write_video(path, "libx264", "yuv420p", options={"crf": "4"})
+    lay_on_its_side(path)
     video = open_video(path)
     assert video.size == (64, 96)
     picture = next(iter(video.read())).picture
@@ -189,11 +194,7 @@ def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
     path = tmp_path / "a.mp4"
     write_video(path, "libx264", "yuv420p", options={"crf": "25", "aq-mode": "1", "aq-strength": "2"})
     plain = [frame.steps for frame in open_video(path).read()]
-    content = bytearray(path.read_bytes())
-    matrix = content.index(b"tkhd") + 44
-    one = 0x10000
-    content[matrix : matrix + 36] = struct.pack(">9i", 0, one, 0, -one, 0, 0, 64 * one, 0, 0x40000000)
-    path.write_bytes(content)
+    lay_on_its_side(path)
     turned = list(open_video(path).read())
     for steps, frame in zip(plain, turned, strict=True):
         assert steps is not None

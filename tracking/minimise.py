@@ -1,0 +1,212 @@
+"""Levenberg and Marquardt's steps towards the disc that explains some pixels best."""
+
+import numpy as np
+from numba import njit
+
+from tracking.disc import CHUNK, FAST, LARGEST, LEAST_BLUR, MOST_BLUR, PARAMETERS, WEIGHT, WEIGHTED, J, linearise
+
+NEAR = 0.03  # px: the next step would be a hundred times smaller
+# Steps that leave the normal matrix nearly as it was: of the centre and of the radius [px], and the share by which the
+# contrast and the edge's variance may change.
+CLOSE, SWELLING, CHANGE = 1.0, 0.3, 0.05
+SHRINKING = 0.4  # of one such step to the next, at most
+LITTLE = 1e-3  # of the normal matrix' diagonal: damping that changes neither steps nor variances to speak of
+WORTHLESS = 1.0  # of a pixel's mean squared residual: a gain that says nothing more about the disc
+
+
+@njit(**FAST)
+def normal_equations(p, smeared, x0, y0, count, w, H):  # type: ignore[no-untyped-def]
+    """Fills H (13, 16), lower triangle: J W J^T; its last row ends in the weighted squared residual."""
+    H[:] = 0.0
+    for first in range(0, count, CHUNK):
+        some = min(CHUNK, count - first)
+        linearise(p, smeared, x0, y0, first, some, w)
+        add_products(first, some, w, H)
+
+
+@njit(**FAST)
+def add_products(first, count, w, H):  # type: ignore[no-untyped-def]
+    """Adds a chunk of linearised pixels to H (13, 16)."""
+    count = min(count, CHUNK)
+    first = min(max(first, 0), LARGEST - CHUNK)
+    for i in range(PARAMETERS + 1):
+        row = J + i * CHUNK
+        for k in range(count):
+            w[WEIGHTED + k] = w[WEIGHT + first + k] * w[row + k]
+        for j in range(0, i + 1, 4):  # past the diagonal too: four sums at once are as fast as one
+            column = J + j * CHUNK
+            sum0 = np.float32(0.0)
+            sum1 = np.float32(0.0)
+            sum2 = np.float32(0.0)
+            sum3 = np.float32(0.0)
+            for k in range(count):
+                factor = w[WEIGHTED + k]
+                sum0 += factor * w[column + k]
+                sum1 += factor * w[column + CHUNK + k]
+                sum2 += factor * w[column + 2 * CHUNK + k]
+                sum3 += factor * w[column + 3 * CHUNK + k]
+            H[i, j] += sum0
+            H[i, j + 1] += sum1
+            H[i, j + 2] += sum2
+            H[i, j + 3] += sum3
+
+
+@njit(**FAST)
+def _score(p, smeared, x0, y0, count, w, score):  # type: ignore[no-untyped-def]
+    """Fills score (12), J W r; returns the weighted squared residual."""
+    score[:] = 0.0
+    total = 0.0
+    for first in range(0, count, CHUNK):
+        some = min(CHUNK, count - first)
+        linearise(p, smeared, x0, y0, first, some, w)
+        squares, _ = add_scores(first, some, w, score)
+        total += squares
+    return total
+
+
+@njit(**FAST)
+def add_scores(first, count, w, score):  # type: ignore[no-untyped-def]
+    """Adds a chunk of linearised pixels to score (12), J W r; returns its squared residual and its weight."""
+    count = min(count, CHUNK)
+    first = min(max(first, 0), LARGEST - CHUNK)
+    squares = np.float32(0.0)
+    used = np.float32(0.0)
+    for k in range(count):
+        w[WEIGHTED + k] = w[WEIGHT + first + k] * w[J + 12 * CHUNK + k]
+        squares += w[WEIGHTED + k] * w[J + 12 * CHUNK + k]
+        used += w[WEIGHT + first + k]
+    for i in range(PARAMETERS):
+        row = J + i * CHUNK
+        total = np.float32(0.0)
+        for k in range(count):
+            total += w[WEIGHTED + k] * w[row + k]
+        score[i] += total
+    return squares, used
+
+
+@njit(**FAST)
+def factorise(H, damping, L):  # type: ignore[no-untyped-def]
+    """L L^T = H + damping diag H; False where that is not positive definite."""
+    for i in range(PARAMETERS):
+        for j in range(i + 1):
+            total = H[i, j]
+            if i == j:
+                total += (damping + 1e-9) * H[i, i] + 1e-12
+            for k in range(j):
+                total -= L[i, k] * L[j, k]
+            if i == j:
+                if not total > 0.0:
+                    return False
+                L[i, i] = np.sqrt(total)
+            else:
+                L[i, j] = total / L[j, j]
+    return True
+
+
+@njit(**FAST)
+def substitute(L, x):  # type: ignore[no-untyped-def]
+    """x becomes (L L^T)^-1 x."""
+    for i in range(PARAMETERS):
+        total = x[i]
+        for k in range(i):
+            total -= L[i, k] * x[k]
+        x[i] = total / L[i, i]
+    for i in range(PARAMETERS - 1, -1, -1):
+        total = x[i]
+        for k in range(i + 1, PARAMETERS):
+            total -= L[k, i] * x[k]
+        x[i] = total / L[i, i]
+
+
+@njit(**FAST)
+def keep_possible(p, smeared):  # type: ignore[no-untyped-def]
+    """Keeps W's variances within bounds and its off-diagonal below what makes it indefinite."""
+    p[5] = min(max(p[5], LEAST_BLUR), MOST_BLUR)
+    if smeared:
+        return
+    p[7] = min(max(p[7], LEAST_BLUR), MOST_BLUR)
+    most = 0.95 * np.sqrt(p[5] * p[7])
+    p[6] = min(max(p[6], -most), most)
+
+
+@njit(**FAST)
+def _is_close(p, step):  # type: ignore[no-untyped-def]
+    """Whether a step from p leaves the normal matrix nearly as it was."""
+    swelling = max(abs(step[2]), abs(step[4])) / (p[2] * p[4] - p[3] * p[3])
+    change = max(abs(step[8] / p[8]), 0.5 * (abs(step[5]) + abs(step[7])) / (p[5] + p[7]))
+    return max(abs(step[0]), abs(step[1])) < CLOSE and swelling < SWELLING and change < CHANGE
+
+
+@njit(**FAST)
+def _approach(p, smeared, x0, y0, count, w, L, length, best):  # type: ignore[no-untyped-def]
+    """Goes on from p with one factor of the normal matrix; False, p being spoilt, where that does not get near.
+
+    length: of the step that led to p; best: cost before it.
+    """
+    score = np.zeros(PARAMETERS)
+    step = np.zeros(PARAMETERS)
+    for _ in range(4):
+        squares = _score(p, smeared, x0, y0, count, w, score)
+        if not squares <= best * (1.0 + 1e-6):
+            return False
+        step[:] = score
+        substitute(L, step)
+        gain = 0.0
+        for i in range(PARAMETERS):
+            gain += step[i] * score[i]
+            p[i] += step[i]
+        keep_possible(p, smeared)
+        best, before = squares, length
+        length = max(abs(step[0]), abs(step[1]))
+        if length < NEAR and gain * count < WORTHLESS * best:
+            return True
+        if length > SHRINKING * before:
+            return False
+    return False
+
+
+@njit(**FAST)
+def minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-def]
+    """Levenberg and Marquardt's steps from p, which is filled with the result; False where they fail.
+
+    H holds the normal equations at p. Ends within `NEAR` of the minimum; L then factors H there, or nearly.
+    """
+    n = PARAMETERS
+    trial = p.copy()
+    step = np.zeros(n)
+    damping = 1e-3
+    best = np.inf
+    for attempt in range(40):
+        if attempt > 0:
+            normal_equations(trial, smeared, x0, y0, count, w, H)
+        cost = H[n, n]
+        if not cost < np.inf:
+            return False
+        if cost <= best * (1.0 + 1e-6):
+            best = cost
+            p[:] = trial
+            for i in range(n):
+                step[i] = H[n, i]
+            damping = max(0.1 * damping, 1e-7)
+            if not factorise(H, damping, L):
+                return False
+            substitute(L, step)
+            gain = 0.0
+            for i in range(n):
+                gain += step[i] * H[n, i]
+        else:  # back, and less far
+            damping = max(30.0 * damping, 1e-3)
+            if damping > 1e4:
+                return False
+            step *= 0.2
+            gain = np.inf
+        trial[:] = p + step
+        keep_possible(trial, smeared)
+        length = max(abs(step[0]), abs(step[1]))
+        if damping < LITTLE and length < NEAR and gain * count < WORTHLESS * best:
+            p[:] = trial
+            return True
+        if damping < LITTLE and _is_close(p, step) and _approach(trial, smeared, x0, y0, count, w, L, length, best):
+            p[:] = trial
+            return True
+    return False
