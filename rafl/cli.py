@@ -23,11 +23,13 @@ from rafl.evaluation import (
     motion_table,
     split_table,
 )
+from rafl.fit import prepared
 from rafl.methods import EPOCHS, METHODS, check_inputs
 from rafl.processes import process_count, rank
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
 from rafl.sysid import spoken
+from rafl.targets import can_be_followed
 
 # The network is small; the other core serves the element kernels.
 TORCH_THREADS = 1
@@ -69,6 +71,13 @@ def fit(
     start: Annotated[
         Path | None, typer.Option("--from", help="Run to fine-tune, or a sysid run whose material to correct (rafl).")
     ] = None,
+    integrator: Annotated[
+        str,
+        typer.Option(
+            help="By which the simulator steps: implicit-euler, whose damping the field learns to make up for, or "
+            "generalised-alpha, which hardly damps [the datasets' own]."
+        ),
+    ] = "",
     by_sigma: Annotated[
         bool, typer.Option("--by-sigma", help="Weigh markers by their uncertainty (rafl, sysid).")
     ] = False,
@@ -86,12 +95,12 @@ def fit(
         raise InputError("--frames: expected 0 (all) or at least 2, found 1")
     loaded = [read_dataset(path) for path in datasets]
     run = out or Path("runs") / f"{loaded[0].name}-{method}"
-    check_inputs(method, loaded, start)
+    check_inputs(method, loaded, start, integrator)
     epochs = epochs or EPOCHS[method]
     settings = Settings(
         method, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
         weight_decay, patience, frames, seed, batch, force_penalty, warm_start,
-        str(start.resolve()) if start else "", by_sigma,
+        str(start.resolve()) if start else "", by_sigma, integrator,
     )  # fmt: skip
     first = rank() == 0  # of the processes that torchrun started
     open_writer = _summary_writer() if tensorboard else None
@@ -99,6 +108,9 @@ def fit(
         _open_run(run, settings, resume)
         if process_count() > batch:
             typer.echo(f"{process_count()} processes share out {batch}: give --batch to use them all", err=True)
+        taught = [can_be_followed(dataset.simulator) for dataset in prepared(loaded, settings)]
+        if method == "rafl" and warm_start and not start and not any(taught):
+            typer.echo("no warm start: it needs implicit-euler, one substep and no viscosity", err=True)
     writer = open_writer(run) if open_writer and first else None
     with progress() as bar:
         task = bar.add_task("epoch", total=epochs)

@@ -59,7 +59,9 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
     simulated, errors, shapes, sizes = {}, {}, {}, {}
     with torch.no_grad():
         for method, model in {ORIGINAL: FittedModel(ORIGINAL), **models}.items():
-            q, force = recordings.motion(model.residual(dataset.simulator), model.parameters(dataset.simulator))
+            simulator = model.simulator(dataset.simulator)
+            motion = recordings.in_simulator(simulator).motion
+            q, force = motion(model.residual(simulator), model.parameters(simulator))
             markers = dataset.markers.positions(q)
             simulated[method] = markers.numpy()
             shapes[method] = q.numpy()

@@ -50,6 +50,16 @@ def shortened(dataset: Dataset, frames: int) -> Dataset:
     return replace(dataset, trajectories={name: cut(item) for name, item in dataset.trajectories.items()})
 
 
+def prepared(datasets: list[Dataset], settings: Settings) -> list[Dataset]:
+    """The datasets with the frames and the integrator to train with."""
+    result = [shortened(dataset, settings.frames) for dataset in datasets]
+    if not settings.integrator:
+        return result
+    return [
+        replace(dataset, simulator=replace(dataset.simulator, integrator=settings.integrator)) for dataset in result
+    ]
+
+
 @dataclass(frozen=True)
 class Item:
     """One recording to train on."""
@@ -95,8 +105,10 @@ def mean_error(sets: list[Recordings], model: FittedModel) -> float:
     with torch.no_grad():
         for recordings in sets:
             try:
-                simulator = recordings.dataset.simulator
-                simulated, _ = recordings.simulate(model.residual(simulator), model.parameters(simulator))
+                simulator = model.simulator(recordings.dataset.simulator)
+                simulated, _ = recordings.in_simulator(simulator).simulate(
+                    model.residual(simulator), model.parameters(simulator)
+                )
             except SimulationError:
                 return math.inf
             errors += frame_errors(recordings, simulated)
@@ -115,9 +127,10 @@ def model_to_go_on_from(run: Path) -> FittedModel:
     return model
 
 
-def _of_material(dataset: Dataset, identified: dict[str, float] | None) -> Dataset:
-    values: dict[str, Any] = dict(identified or {})
-    simulator = dataset.simulator
+def _corrected(dataset: Dataset, start: FittedModel, stepping: bool) -> Dataset:
+    """With what an earlier run identified, and, where wanted, stepping as that run did."""
+    values: dict[str, Any] = dict(start.material or {})
+    simulator = start.simulator(dataset.simulator) if stepping else dataset.simulator
     return replace(dataset, simulator=replace(simulator, material=replace(simulator.material, **values)))
 
 
@@ -141,9 +154,8 @@ def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, r
         InputError: nothing to train on, or a checkpoint that is not of this run.
         SimulationError: every rollout of an epoch failed; names recording and step.
     """
-    cut = [shortened(dataset, settings.frames) for dataset in datasets]
     with processes() as group:
-        return _Training(cut, settings, run, report, group).go()
+        return _Training(prepared(datasets, settings), settings, run, report, group).go()
 
 
 class _Training:
@@ -155,12 +167,12 @@ class _Training:
         self.settings, self.run, self.group = settings, run, group
         self.report: Report = report if group.first else lambda row: None
         start = model_to_go_on_from(Path(settings.start)) if settings.start else FittedModel("rafl")
-        datasets = [_of_material(dataset, start.material) for dataset in datasets]
+        datasets = [_corrected(dataset, start, stepping=not settings.integrator) for dataset in datasets]
         self.items, self.validate = training_items(datasets), validation_batches(datasets)
         self.history: list[dict[str, float]] = []
         torch.manual_seed(settings.seed)
         self.field = ResidualField() if start.field is None else start.field
-        self.model = FittedModel("rafl", field=self.field, material=start.material)
+        self.model = FittedModel("rafl", self.field, start.material, stepping=datasets[0].simulator.stepping)
         if start.field is None and not (run / CHECKPOINT).exists():
             self._teach(datasets)
         self.optimiser = torch.optim.Adam(

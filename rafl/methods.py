@@ -6,6 +6,7 @@ from pathlib import Path
 from groundwork import InputError
 from rafl.dataset import Dataset
 from rafl.fit import Report, fit_residual_field, model_to_go_on_from, training_items
+from rafl.integrator import INTEGRATORS
 from rafl.run import FittedModel, Settings
 from rafl.supervised import fit_supervised, one_mesh
 from rafl.sysid import SOUGHT, identify_material
@@ -20,19 +21,24 @@ METHODS: dict[str, Trainer] = {
 EPOCHS = {"rafl": 30, "srl": 1000, **dict.fromkeys(SOUGHT, 40)}  # at most, where the user does not say
 
 
-def check_inputs(method: str, datasets: list[Dataset], start: Path | None) -> None:
+def check_inputs(method: str, datasets: list[Dataset], start: Path | None, integrator: str) -> None:
     """Refuses what a method cannot be fitted to, before anything is written.
 
     Args:
         method: to be.
         datasets: to train on.
         start: run to go on from.
+        integrator: to train with; the run's or the datasets' own where empty.
 
     Raises:
-        InputError: an unknown method, no training recordings, several meshes for srl, nothing to go on from.
+        InputError: an unknown method or integrator, datasets that step differently, no training recordings, several
+            meshes for srl, nothing to go on from.
     """
     if method not in METHODS:
         raise InputError(f"--method: expected {', '.join(METHODS)}, found {method!r}")
+    if integrator and integrator not in INTEGRATORS:
+        raise InputError(f"--integrator: expected {' or '.join(INTEGRATORS)}, found {integrator!r}")
+    _one_stepping(datasets, integrator)
     training_items(datasets)
     if method == "srl":
         one_mesh(datasets)
@@ -40,3 +46,16 @@ def check_inputs(method: str, datasets: list[Dataset], start: Path | None) -> No
         if method != "rafl":
             raise InputError(f"--from: expected method rafl, found {method}; leave it out")
         model_to_go_on_from(start)
+
+
+def _one_stepping(datasets: list[Dataset], integrator: str) -> None:
+    """Refuses datasets whose simulators step differently: a model is of one way to step."""
+    ways = {
+        dataset.name: (integrator or dataset.simulator.integrator, dataset.simulator.substeps) for dataset in datasets
+    }
+    if len(set(ways.values())) > 1:
+        found = ", ".join(f"{name}: {way}, {substeps} substeps" for name, (way, substeps) in ways.items())
+        raise InputError(
+            f"expected datasets whose simulators step alike, found {found}; set `simulation` in the specimen files and "
+            "run rafl-capture again"
+        )

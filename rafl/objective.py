@@ -10,6 +10,7 @@ from torch import Tensor
 from rafl.dataset import Dataset
 from rafl.parameters import Parameters
 from rafl.rollout import ResidualForce, rollout
+from rafl.simulator import Simulator
 
 LOSS_SCALE = 1e3
 LEAST_SIGMA = 0.2  # of the median: nothing counts more than 25 times the usual
@@ -49,6 +50,11 @@ class Recordings:
             own = (usual / np.maximum(item.sigma, LEAST_SIGMA * usual)) ** 2 if by_sigma else 1.0
             weight[: len(item.time), b] = item.valid[..., None] * own
         return cls(dataset, names, *(torch.from_numpy(array) for array in (markers, valid, weight)))
+
+    def in_simulator(self, simulator: Simulator) -> "Recordings":
+        """The same recordings, to be simulated in another way."""
+        same = simulator is self.dataset.simulator
+        return self if same else replace(self, dataset=replace(self.dataset, simulator=simulator))
 
     def of_markers(self, chosen: NDArray[np.int64]) -> "Recordings":
         """The same recordings with some of the markers only."""

@@ -1,8 +1,9 @@
 """A run folder: the fitted model, its settings, its history and where to resume."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -21,7 +22,7 @@ FORMAT = "rafl-run/1"
 
 @dataclass(frozen=True)
 class FittedModel:
-    """What a fit leaves: a residual field, identified material parameters, or both.
+    """What a fit leaves: a residual field, identified material parameters, or both, and how time was stepped with them.
 
     Attributes:
         method: one of `rafl.methods.METHODS`.
@@ -29,12 +30,18 @@ class FittedModel:
         material: identified values by their name in `rafl.parameters.Parameters`, for `sysid` and its kin, and for a
             field that was trained on top of such.
         network: from the whole state to nodal forces, for `srl`.
+        stepping: `integrator` and `substeps` of the simulator that it was fitted in; a specimen's own where None.
     """
 
     method: str
     field: ResidualField | None = None
     material: dict[str, float] | None = None
     network: GlobalResidual | None = None
+    stepping: dict[str, Any] | None = None
+
+    def simulator(self, own: Simulator) -> Simulator:
+        """A specimen's simulator, stepping as the one that this was fitted in."""
+        return own if self.stepping in (None, own.stepping) else replace(own, **self.stepping)
 
     def residual(self, simulator: Simulator) -> ResidualForce | None:
         """The residual force on a specimen, if this model has one.
@@ -68,6 +75,7 @@ class Settings:
         warm_start: passes over the forces that follow the recordings step by step, before the first simulation.
         start: run folder whose field or material training goes on from; empty for new weights and the datasets' own.
         by_sigma: whether markers count by their uncertainty.
+        integrator: by which the simulator steps; empty for that of `start` or else of the datasets.
     """
 
     method: str
@@ -83,6 +91,7 @@ class Settings:
     warm_start: int = 0
     start: str = ""
     by_sigma: bool = False
+    integrator: str = ""
 
 
 def write_settings(run: Path, settings: Settings) -> None:
@@ -137,6 +146,8 @@ def save_model(run: Path, model: FittedModel) -> None:
         content["field"] = model.field.state_dict()
     if model.material is not None:
         content["material"] = dict(model.material)
+    if model.stepping is not None:
+        content["stepping"] = dict(model.stepping)
     if model.network is not None:
         content |= {"nodes": model.network.nodes, "network": model.network.state_dict()}
     save_tensors(run / "model.pt", content)
@@ -159,7 +170,7 @@ def load_model(run: Path) -> FittedModel:
     if "field" in content:
         field = ResidualField()
         field.load_state_dict(content["field"])
-    return FittedModel(content["method"], field, material, network)
+    return FittedModel(content["method"], field, material, network, content.get("stepping"))
 
 
 def stale(errors: Sequence[float], patience: int) -> bool:

@@ -64,6 +64,11 @@ class Simulator:
         if not (self.time_step > 0 and self.substeps >= 1):
             raise ValueError(f"expected time_step > 0 and substeps >= 1, got {self.time_step} and {self.substeps}")
 
+    @property
+    def stepping(self) -> dict[str, Any]:
+        """How time is stepped, by the names of this class."""
+        return {"integrator": self.integrator, "substeps": self.substeps}
+
     @cached_property
     def engine(self) -> Engine:
         """Energy, gradient, tangent and linear solves."""

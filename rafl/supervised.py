@@ -8,7 +8,7 @@ from torch import Tensor
 
 from groundwork import InputError
 from rafl.dataset import Dataset
-from rafl.fit import Report, mean_error, shortened, training_items, validation_batches
+from rafl.fit import Report, mean_error, prepared, training_items, validation_batches
 from rafl.global_residual import GlobalResidual
 from rafl.run import FittedModel, Settings, load_model, save_model, stale, write_history
 from rafl.targets import training_targets
@@ -29,7 +29,7 @@ def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, repor
         InputError: nothing to train on, or datasets of different meshes.
         SimulationError: the recordings cannot be followed.
     """
-    cut = [shortened(dataset, settings.frames) for dataset in datasets]
+    cut = prepared(datasets, settings)
     nodes = one_mesh(cut)
     training_items(cut)
     validate = validation_batches(cut)
@@ -38,7 +38,7 @@ def fit_supervised(datasets: list[Dataset], settings: Settings, run: Path, repor
     network = GlobalResidual(nodes)
     network.normalise(states, forces)
     wanted = (forces - network.force_mean) / network.force_size
-    model = FittedModel("srl", network=network)
+    model = FittedModel("srl", network=network, stepping=cut[0].simulator.stepping)
     optimiser = torch.optim.Adam(network.parameters(), lr=RATE, weight_decay=settings.weight_decay)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, settings.epochs, eta_min=0.01 * RATE)
     history = [{"epoch": 0, "loss": math.nan, "validation_mm": 1e3 * mean_error(validate, FittedModel("original"))}]

@@ -15,7 +15,7 @@ from torch import Tensor
 from groundwork import write_text
 from rafl.dataset import Dataset
 from rafl.errors import SimulationError
-from rafl.fit import Report, batches, mean_error, shortened, training_items, validation_batches
+from rafl.fit import Report, batches, mean_error, prepared, training_items, validation_batches
 from rafl.objective import training_loss
 from rafl.run import FORMAT, FittedModel, Settings, load_tensors, save_model, save_tensors, write_history
 
@@ -98,10 +98,10 @@ class _Search:
     """The objective, what it has been asked so far, and the history."""
 
     def __init__(self, datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> None:
-        cut = [shortened(dataset, settings.frames) for dataset in datasets]
+        cut = prepared(datasets, settings)
         self.train, self.validate = batches(training_items(cut), settings.by_sigma), validation_batches(cut)
         self.quantities, self.settings, self.run, self.report = SOUGHT[settings.method], settings, run, report
-        self.assumed = datasets[0].simulator.material
+        self.simulator = cut[0].simulator
         self.history: list[dict[str, float]] = []
         self.known: dict[tuple[float, ...], tuple[float, list[float]]] = {}
         self.file = run / "checkpoint.pt"
@@ -111,9 +111,8 @@ class _Search:
 
     def begins(self) -> list[Array]:
         """Where to begin: the assumed material first."""
-        own = np.array([
-            np.clip(q.variable(max(float(getattr(self.assumed, q.name)), q.low)), *q.bounds) for q in self.quantities
-        ])  # fmt: skip
+        assumed = {q: max(float(getattr(self.simulator.material, q.name)), q.low) for q in self.quantities}
+        own = np.array([np.clip(q.variable(value), *q.bounds) for q, value in assumed.items()])
         if self.settings.method == "sysid-damping":
             own[2] = max(own[2], DAMPING.variable(1.0))
         result = [own]
@@ -131,7 +130,7 @@ class _Search:
     def model(self, x: Array) -> FittedModel:
         """With the material of variables x."""
         material = {name: float(value) for name, value in self.values(x).items()}
-        return FittedModel(self.settings.method, material=material)
+        return FittedModel(self.settings.method, material=material, stepping=self.simulator.stepping)
 
     def __call__(self, x: Array) -> tuple[float, Array]:
         """Loss and its gradient; a high wall where a simulation fails, so that the line search comes back."""
@@ -194,12 +193,12 @@ class _Search:
 
         Markers' errors are taken as independent, of the size of what the fit leaves; the curvature of the loss then
         is the information. A number at its bound has no interval; none has one where a material beside the best
-        cannot be simulated.
+        cannot be simulated, or where the search ended short of a minimum.
         """
         inside = [k for k, q in enumerate(self.quantities) if q.bounds[0] + STEP < x[k] < q.bounds[1] - STEP]
         covariance = np.full((len(x), len(x)), np.nan)
         curvature = self._curvature(x, inside)
-        if curvature is not None:
+        if curvature is not None and np.linalg.eigvalsh(curvature)[0] > 0.0:
             seen = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.train)
             own = 2.0 * self(x)[0] / max(seen - len(x), 1.0) * np.linalg.pinv(curvature)
             covariance[np.ix_(inside, inside)] = own
@@ -236,7 +235,7 @@ def spoken(table: pd.DataFrame) -> list[str]:
         interval = (
             interval
             if np.isfinite(row["low_95"])
-            else "no interval: at its bound, or a material beside it cannot be simulated"
+            else "no interval: at its bound, short of the best fit, or beside a material that cannot be simulated"
         )
         lines.append(f"{row['name']} = {row['value']:.5g}{unit} ({interval})")
     for a, b in itertools.combinations(range(len(table)), 2):

@@ -10,6 +10,7 @@ from groundwork import InputError
 from rafl import fit
 from rafl.dataset import Dataset
 from rafl.errors import SimulationError
+from rafl.evaluation import compare
 from rafl.fit import fit_residual_field, mean_error, training_items, validation_batches
 from rafl.mesh import HexMesh
 from rafl.objective import Recordings
@@ -84,6 +85,25 @@ def test_system_identification_explains_the_recordings(dataset: Dataset, tmp_pat
     assert model.material["youngs_modulus"] == pytest.approx(190e3, rel=0.15)
     assert model.material["poissons_ratio"] == pytest.approx(0.45, abs=0.05)
     assert load_model(tmp_path).material == model.material
+
+
+def test_a_model_steps_as_it_was_fitted(dataset: Dataset, tmp_path: Path) -> None:
+    """Whatever integrator a dataset names; and what goes on from a model steps likewise."""
+    settings = replace(SETTINGS, method="sysid", epochs=2, integrator="generalised-alpha")
+    identified = identify_material([dataset], settings, tmp_path / "a", silent)
+    assert load_model(tmp_path / "a").stepping == {"integrator": "generalised-alpha", "substeps": 1}
+    stepped = replace(dataset, simulator=replace(dataset.simulator, integrator="generalised-alpha"))
+    own, other = (mean_error([Recordings.of(each, ["d"])], identified) for each in (stepped, dataset))
+    assert own == other
+    assert own != mean_error([Recordings.of(dataset, ["d"])], replace(identified, stepping=None))
+    errors = compare(stepped, {"sysid": identified})[-1].errors["sysid"]
+    assert errors.mean() == pytest.approx(own)
+    rows: list[dict[str, float]] = []
+    settings = replace(SETTINGS, epochs=1, frames=0, start=str(tmp_path / "a"))
+    corrected = fit_residual_field([dataset], settings, tmp_path / "b", rows.append)
+    assert corrected.stepping == identified.stepping
+    untrained = 1e3 * mean_error(validation_batches([dataset]), identified)
+    assert rows[0]["validation_mm"] == pytest.approx(untrained, rel=0.05)  # the new field is nearly none
 
 
 def test_a_field_corrects_the_identified_material(dataset: Dataset, tmp_path: Path) -> None:
