@@ -62,6 +62,10 @@ class Recordings:
         rest = (array[:, :, chosen] for array in (self.markers, self.valid, self.weight))
         return Recordings(dataset, self.names, *rest)
 
+    def first(self, frames: int) -> "Recordings":
+        """The same recordings up to a frame."""
+        return replace(self, **{key: getattr(self, key)[:frames] for key in ("markers", "valid", "weight")})
+
     def simulate(
         self, residual: ResidualForce | None = None, parameters: Parameters | None = None
     ) -> tuple[Tensor, Tensor]:

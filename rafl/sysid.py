@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import OptimizeResult, minimize
+from scipy.optimize import minimize
 from torch import Tensor
 
 from groundwork import write_text
@@ -23,7 +23,11 @@ Array = NDArray[Any]
 
 NEARLY_INCOMPRESSIBLE = 0.499  # nu where E alone is sought, as the paper has it
 STARTS = (0.6, 1.7)  # times the assumed E, where the search begins again
-ROUNDS = 2  # iterations before the best of the starts goes on alone
+# Leading frames that the search begins with, as shares of all and at least so many: over many swings the best is
+# hidden behind others, where a simulation is whole swings ahead or behind.
+SHARES, LEAST_FRAMES = (0.15, 0.4), 8
+ROUNDS = 3  # iterations with each of these
+STRIDE = 0.2  # of a variable: the first step
 NORMAL = 1.959964  # 95 % of a normal distribution lie within as many standard deviations
 WALL = 1e6  # the loss where a simulation fails
 STEP = 1e-3  # of a variable, for the curvature's finite differences of the exact gradient
@@ -36,7 +40,7 @@ class Quantity:
     Attributes:
         name: in `rafl.parameters.Parameters`.
         low, high: bounds.
-        kind: `log`: its logarithm; `gap`: the logarithm of 1/2 minus it; `root`: its square root.
+        kind: `log`: its logarithm; `gap`: the logarithm of 1/2 minus it; `root`: the root of its share of `usual`.
         unit: for messages.
     """
 
@@ -45,19 +49,20 @@ class Quantity:
     high: float
     kind: str
     unit: str
+    usual: float = 1.0
 
     def variable(self, value: float) -> float:
         """Of a value."""
         if self.kind == "log":
             return float(np.log(value))
-        return float(np.log(0.5 - value)) if self.kind == "gap" else float(np.sqrt(value))
+        return float(np.log(0.5 - value)) if self.kind == "gap" else float(np.sqrt(value / self.usual))
 
     def value(self, variable: Any) -> Any:
         """Of a variable, a float or a tensor."""
         exp = torch.exp if isinstance(variable, Tensor) else np.exp
         if self.kind == "log":
             return exp(variable)
-        return 0.5 - exp(variable) if self.kind == "gap" else variable**2
+        return 0.5 - exp(variable) if self.kind == "gap" else self.usual * variable**2
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -68,29 +73,32 @@ class Quantity:
 
 MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa")
 POISSON = Quantity("poissons_ratio", 0.3, 0.499, "gap", "")
-DAMPING = Quantity("mass_damping", 0.0, 100.0, "root", "1/s")
-SOUGHT = {"sysid": (MODULUS, POISSON), "sysid-e": (MODULUS,), "sysid-damping": (MODULUS, POISSON, DAMPING)}
+VISCOSITY = Quantity("viscosity", 0.0, 1e4, "root", "Pa s", usual=100.0)
+SOUGHT = {"sysid": (MODULUS, POISSON), "sysid-e": (MODULUS,), "sysid-damping": (MODULUS, POISSON, VISCOSITY)}
 
 
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
     """Fit material numbers to the training recordings by L-BFGS-B within bounds, from several starts.
 
-    The search begins at the datasets' assumed material and at softer and stiffer ones; after two iterations the best
-    goes on. `parameters.csv` in the run says how sure each number is and which trade off against one another. What a
-    killed run had tried is read from its checkpoint and not simulated again.
+    The search begins at the datasets' assumed material and at softer and stiffer ones, with the recordings' first
+    frames; the best goes on with more and more of them. `parameters.csv` in the run says how sure each number is and
+    which trade off against one another. What a killed run had tried is read from its checkpoint and not simulated
+    again.
 
     Raises:
         InputError: no recording to train on.
         SimulationError: the assumed material itself cannot be simulated.
     """
     search = _Search(datasets, settings, run, report)
-    begins = search.begins()
-    first = [search.descend(begin, ROUNDS) for begin in begins]
-    best = min(first, key=lambda result: result.fun)
-    last = search.descend(best.x, max(settings.epochs - ROUNDS, 0))
-    model = search.model(last.x)
+    starts = search.begins()
+    for share in SHARES:
+        search.see(share)
+        starts = [min((search.descend(start, ROUNDS) for start in starts), key=lambda result: result[0])[1]]
+    search.see(1.0)
+    _, found = search.descend(starts[0], max(settings.epochs - ROUNDS * len(SHARES), 1))
+    model = search.model(found)
     save_model(run, model)
-    write_text(run / "parameters.csv", search.certainty(last.x))
+    write_text(run / "parameters.csv", search.certainty(found))
     return model
 
 
@@ -102,19 +110,25 @@ class _Search:
         self.train, self.validate = batches(training_items(cut), settings.by_sigma), validation_batches(cut)
         self.quantities, self.settings, self.run, self.report = SOUGHT[settings.method], settings, run, report
         self.simulator = cut[0].simulator
+        self.frames = 0  # that are simulated
         self.history: list[dict[str, float]] = []
-        self.known: dict[tuple[float, ...], tuple[float, list[float]]] = {}
+        self.known: dict[tuple[float, ...], tuple[float, list[float]]] = {}  # by frames and variables
         self.file = run / "checkpoint.pt"
         if self.file.exists():
             saved = load_tensors(self.file, "a checkpoint of this run")
-            self.known = {tuple(x): (loss, slope) for x, loss, slope in saved["known"]}
+            self.known = {tuple(asked): (loss, slope) for asked, loss, slope in saved["known"]}
+
+    def see(self, share: float) -> None:
+        """Simulate a share of the frames from now on."""
+        longest = max(len(recordings.markers) for recordings in self.train)
+        self.frames = min(max(int(share * longest), LEAST_FRAMES), longest)
 
     def begins(self) -> list[Array]:
         """Where to begin: the assumed material first."""
         assumed = {q: max(float(getattr(self.simulator.material, q.name)), q.low) for q in self.quantities}
         own = np.array([np.clip(q.variable(value), *q.bounds) for q, value in assumed.items()])
         if self.settings.method == "sysid-damping":
-            own[2] = max(own[2], DAMPING.variable(1.0))
+            own[2] = max(own[2], VISCOSITY.variable(VISCOSITY.usual))
         result = [own]
         for factor in STARTS:
             other = own.copy()
@@ -144,10 +158,10 @@ class _Search:
 
     def _asked(self, x: Array) -> tuple[float, list[float]]:
         """Loss and its gradient, simulated where they are not known yet."""
-        key = tuple(float(value) for value in x)
+        key = (float(self.frames), *(float(value) for value in x))
         if key not in self.known:
             self.known[key] = self._simulate(x)
-            content = [[list(x), loss, slope] for x, (loss, slope) in self.known.items()]
+            content = [[list(asked), loss, slope] for asked, (loss, slope) in self.known.items()]
             save_tensors(self.file, {"format": FORMAT, "method": self.settings.method, "known": content})
         return self.known[key]
 
@@ -156,28 +170,30 @@ class _Search:
         values = self.values(variables)
         count = sum(len(recordings.names) for recordings in self.train)
         total = torch.zeros((), dtype=torch.float64)
-        for recordings in self.train:
+        for recordings in (each.first(self.frames) for each in self.train):
             simulated, forces = recordings.simulate(parameters=recordings.dataset.simulator.parameters(**values))
             total = total + training_loss(recordings, simulated, forces) * len(recordings.names) / count
         total.backward()
         assert variables.grad is not None
         return total.item(), variables.grad.tolist()
 
-    def descend(self, start: Array, iterations: int) -> OptimizeResult:
-        """L-BFGS-B from a start."""
-        scale = self(self.begins()[0])[0]
+    def descend(self, start: Array, iterations: int) -> tuple[float, Array]:
+        """L-BFGS-B from a start; the loss reached, and where."""
+        scale = self(start)[0]
 
-        def relative(x: Array) -> tuple[float, Array]:
-            loss, slope = self(x)
-            return loss / scale, slope / scale
+        def relative(y: Array) -> tuple[float, Array]:
+            loss, slope = self(y * STRIDE)
+            return loss / scale, slope * STRIDE / scale
 
         if not self.history:
             self.record(start, 0)
-        return minimize(
-            relative, start, jac=True, method="L-BFGS-B", bounds=[q.bounds for q in self.quantities],
-            callback=lambda x: self.record(x, int(self.history[-1]["epoch"]) + 1),
+        found = minimize(
+            relative, start / STRIDE, jac=True, method="L-BFGS-B",
+            bounds=[(q.bounds[0] / STRIDE, q.bounds[1] / STRIDE) for q in self.quantities],
+            callback=lambda y: self.record(y * STRIDE, int(self.history[-1]["epoch"]) + 1),
             options={"maxiter": iterations, "ftol": 1e-9, "gtol": 1e-8},
         )  # fmt: skip
+        return scale * float(found.fun), found.x * STRIDE
 
     def record(self, x: Array, number: int) -> None:
         """A row of the history."""

@@ -37,10 +37,33 @@ from rafl.synthetic import hung, let_go
 DATASETS = Path(__file__).parents[2] / "datasets"
 FPS = 100.0
 DONE = "done"
-# From no force at all, as the paper trains: a field that first learned to follow one shape's recordings step by step is
-# ten times as exact there, and on shapes that swing more slowly it feeds the swing.
-OPTIONS: dict[str, list[object]] = {"rafl": ["--warm-start", 0]}
 TOGETHER = 4  # recordings simulated at once
+
+
+@dataclass(frozen=True)
+class Model:
+    """What is fitted under a name.
+
+    Attributes:
+        method, options: of rafl-fit.
+        start: name of the model that it goes on from.
+    """
+
+    method: str
+    options: tuple[object, ...] = ()
+    start: str = ""
+
+
+MODELS = {
+    "sysid": Model("sysid"),
+    "sysid-e": Model("sysid-e"),
+    "srl": Model("srl"),
+    # As the paper trains: from no force at all, under backward differences.
+    "rafl": Model("rafl", ("--warm-start", 0)),
+    # Where the simulator's own damping does not hide the material's.
+    "sysid-damping": Model("sysid-damping", ("--integrator", "generalised-alpha")),
+    "rafl-from-sysid": Model("rafl", start="sysid-damping"),
+}
 
 
 @dataclass(frozen=True)
@@ -51,7 +74,7 @@ class Effort:
         shapes: as many of the study's; all where None.
         recordings: numbers of recordings to train, to validate and to test with; all where None.
         frames: of each recording; as the study says where None.
-        epochs: by method.
+        epochs: by model.
     """
 
     shapes: tuple[str, ...] | None
@@ -60,12 +83,17 @@ class Effort:
     epochs: dict[str, int]
 
 
-FULL = Effort(None, None, None, {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12})
+FULL = Effort(
+    None,
+    None,
+    None,
+    {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12, "sysid-damping": 14, "rafl-from-sysid": 12},
+)
 QUICK = Effort(
     ("canonical", "thicker-scaled", "shorter"),
     (3, 1, 2),
     50,
-    {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8},
+    {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8, "sysid-damping": 8, "rafl-from-sysid": 4},
 )
 
 
@@ -84,10 +112,10 @@ class Study:
     def specimen(self, shape: str) -> Path:
         return DATASETS / "specimens" / f"{shape}.yaml"
 
-    def methods(self, shape: str) -> dict[str, int]:
-        """Epochs by method; supervised learning, which is tied to a mesh, where the mesh is the first shape's too."""
+    def models(self, shape: str) -> dict[str, int]:
+        """Epochs by model; supervised learning, which is tied to a mesh, where the mesh is the first shape's too."""
         nodes = [len(read_specimen(self.specimen(each)).mesh.vertices) for each in (shape, self.shapes[0])]
-        return {method: n for method, n in self.effort.epochs.items() if method != "srl" or nodes[0] == nodes[1]}
+        return {name: n for name, n in self.effort.epochs.items() if name != "srl" or nodes[0] == nodes[1]}
 
     def lab(self, shape: str) -> Specimen:
         """The specimen as the lab has it."""
@@ -151,17 +179,18 @@ class Study:
         )  # fmt: skip
 
     def fit(self, shape: str) -> None:
-        """Every method that applies."""
-        for method, epochs in self.methods(shape).items():
-            run = self.out / shape / method
+        """Every model that applies."""
+        for name, epochs in self.models(shape).items():
+            run, model = self.out / shape / name, MODELS[name]
             if (run / DONE).exists():
                 continue
-            print(f"{shape}: fitting {method}", flush=True)
+            print(f"{shape}: fitting {name}", flush=True)
             resume = ["--resume"] if (run / "checkpoint.pt").exists() else []
             if not resume:
                 shutil.rmtree(run, ignore_errors=True)
             dataset = self.out / shape / f"{shape}.h5"
-            options = ["--method", method, "--epochs", epochs, *OPTIONS.get(method, []), *resume]
+            start = ["--from", run.with_name(model.start)] if model.start else []
+            options = ["--method", model.method, "--epochs", epochs, *model.options, *start, *resume]
             command("rafl-fit", dataset, "--out", run, *options)
             (run / DONE).touch()
 
@@ -169,19 +198,22 @@ class Study:
         """Test errors of all models on one shape, by method and the shape trained on."""
         tables = []
         for trained in self.shapes:
-            table = self.out / shape / "tested" / f"{trained}.csv"
-            if not table.exists():
+            path = self.out / shape / "tested" / f"{trained}.csv"
+            table = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["method"])
+            missing = [name for name in self.models(trained) if f"{name}@{trained}" not in set(table["method"])]
+            if missing:
                 print(f"{shape}: testing what was trained on {trained}", flush=True)
                 dataset = read_dataset(self.out / shape / f"{shape}.h5")
                 unseen = {name: dataset.trajectories[name] for name in dataset.split("test")}
                 nodes, models = len(dataset.simulator.mesh.vertices), {}
-                for method in self.methods(trained):
-                    model = load_model(self.out / trained / method)
+                for name in missing:
+                    model = load_model(self.out / trained / name)
                     if model.network is None or model.network.nodes == nodes:
-                        models[f"{method}@{trained}"] = model
-                errors = test_errors(replace(dataset, trajectories=unseen), models)
-                write_text(table, errors.to_csv(index=False))
-            tables.append(pd.read_csv(table))
+                        models[f"{name}@{trained}"] = model
+                if models:
+                    table = pd.concat([table, test_errors(replace(dataset, trajectories=unseen), models)])
+                    write_text(path, table.drop_duplicates("method").to_csv(index=False))
+            tables.append(table)
         return pd.concat(tables).drop_duplicates("method")
 
 
@@ -219,7 +251,7 @@ def main() -> None:
     tested = {shape: study.tested(shape) for shape in study.shapes}
     own = []
     for shape, errors in tested.items():
-        chosen = errors[errors["method"].isin([ORIGINAL, *(f"{method}@{shape}" for method in study.effort.epochs)])]
+        chosen = errors[errors["method"].isin([ORIGINAL, *(f"{name}@{shape}" for name in study.effort.epochs)])]
         own.append(chosen.assign(method=chosen["method"].str.removesuffix(f"@{shape}")))
     table = pd.concat(own)
     write_text(results / "sim2real.csv", table.to_csv(index=False, float_format="%.4f"))

@@ -132,7 +132,7 @@ def test_an_interrupted_identification_goes_on(
 
     calls = []
     simulate = _Search._simulate
-    monkeypatch.setattr(_Search, "_simulate", lambda self, x: (calls.append(tuple(x)), simulate(self, x))[1])
+    monkeypatch.setattr(_Search, "_simulate", lambda self, x: (calls.append((self.frames, *x)), simulate(self, x))[1])
     with pytest.raises(KeyboardInterrupt):
         identify_material([dataset], settings, broken, stop)
     identify_material([dataset], settings, broken, silent)
