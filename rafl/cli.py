@@ -51,7 +51,7 @@ def fit(
         str,
         typer.Option(
             help="rafl: residual field; srl: supervised baseline; sysid: E and nu, sysid-e: E at nu = 0.499, "
-            "sysid-damping: E, nu and damping."
+            "sysid-damping: E, nu and viscosity."
         ),
     ] = "rafl",
     out: Annotated[Path | None, typer.Option(help="Run folder [runs/DATASET-METHOD].")] = None,
@@ -167,13 +167,17 @@ def _open_run(run: Path, settings: Settings, resume: bool) -> None:
 
 
 def _described(model: FittedModel) -> str:
+    if model.network is not None:
+        return f"trained a supervised residual network for meshes of {model.network.nodes} vertices"
+    parts = [] if model.field is None else ["trained a residual acceleration field"]
     if model.material is not None:
         e, nu = model.material["youngs_modulus"], model.material["poissons_ratio"]
         identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
-        return identified if model.field is None else f"trained a residual acceleration field on {identified}"
-    if model.network is not None:
-        return f"trained a supervised residual network for meshes of {model.network.nodes} vertices"
-    return "trained a residual acceleration field"
+        if "viscosity" in model.material:
+            identified += f", viscosity = {model.material['viscosity']:.0f} Pa s"
+        parts.append(identified)
+    stepping = f", stepped by {model.stepping['integrator']}" if model.stepping else ""
+    return " on ".join(parts) + stepping
 
 
 @eval_app.command()
