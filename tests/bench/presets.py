@@ -9,20 +9,21 @@ What stands under --out is not computed again.
 import argparse
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from scipy.optimize import curve_fit, minimize
+from scipy.optimize import curve_fit
 
 from capture.build import CaptureSettings, build_dataset, read_recording_rows
 from capture.specimen import read_specimen
 from rafl.dataset import Dataset
-from rafl.errors import SimulationError
-from rafl.fit import shortened
 from rafl.material import Material
-from rafl.objective import Recordings, frame_errors, training_loss
+from rafl.objective import Recordings, frame_errors
 from rafl.rollout import equilibrium
+from rafl.run import Settings
+from rafl.sysid import identify_material
 
 SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
 REST = ("beam_gravity_V2_b", 65)  # the beam is held straight there
@@ -89,33 +90,13 @@ def describe(dataset: Dataset, material: Material) -> list[dict[str, float | str
     return rows
 
 
-def identified(dataset: Dataset) -> Material:
-    """E, nu and viscosity that explain all recordings best, from a few starts of viscosity."""
-    simulator = dataset.simulator
-    recordings = Recordings.of(shortened(dataset, IDENTIFIED_FRAMES), list(dataset.trajectories))
-
-    def values(x: torch.Tensor) -> dict[str, torch.Tensor]:
-        return {"youngs_modulus": x[0].exp(), "poissons_ratio": 0.5 - x[1].exp(), "viscosity": x[2].exp()}
-
-    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        parameters = torch.tensor(x, requires_grad=True)
-        try:
-            markers, forces = recordings.simulate(parameters=simulator.parameters(**values(parameters)))
-        except SimulationError:
-            return 1e6, np.zeros(3)
-        loss = training_loss(recordings, markers, forces)
-        loss.backward()
-        assert parameters.grad is not None
-        return loss.item(), parameters.grad.numpy()
-
-    material = simulator.material
-    start = np.log([material.youngs_modulus, 0.5 - material.poissons_ratio, 100.0])
-    bounds = [np.log([2e4, 1e7]), np.log([1e-3, 0.2]), np.log([0.1, 1e5])]
-    result = minimize(
-        objective, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25, "ftol": 1e-6}
-    )
-    found = {key: float(value) for key, value in values(torch.tensor(result.x)).items()}
-    return replace(material, **found)
+def identified(dataset: Dataset, run: Path) -> Material:
+    """E, nu and viscosity that explain all recordings best."""
+    items = {name: replace(item, split="train") for name, item in dataset.trajectories.items()}
+    settings = Settings("sysid-damping", (dataset.name,), 25, 1e-3, 0.0, 25, IDENTIFIED_FRAMES, 0)
+    model = identify_material([replace(dataset, trajectories=items)], settings, run, lambda row: None)
+    values: dict[str, Any] = dict(model.material or {})
+    return replace(dataset.simulator.material, **values)
 
 
 def main() -> None:
@@ -135,7 +116,7 @@ def main() -> None:
             plain = Material(described.material.youngs_modulus, described.material.poissons_ratio, **values)
             specimen = replace(described, material=plain, integrator=integrator, substeps=substeps)
             dataset = build_dataset(specimen, arguments.recordings, rows, settings, "", lambda: None)
-            fitted = identified(dataset)
+            fitted = identified(dataset, arguments.out / str(number))
             found = []
             for stage, material in (("assumed", plain), ("identified", fitted)):
                 note = (
