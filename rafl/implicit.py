@@ -97,34 +97,6 @@ class Minimum(torch.autograd.Function):
         )  # fmt: skip
 
 
-class InternalForce(torch.autograd.Function):
-    """The energy's nodal gradient (B, N, 3) [N]; inputs q (B, N, 3) [m], moduli, drift and strain as above."""
-
-    @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any, q: Tensor, moduli: Tensor, drift: Tensor | None, strain: Tensor | None, setting: Setting
-    ) -> Tensor:
-        """Evaluate."""
-        ctx.save_for_backward(q, moduli, drift, strain)
-        ctx.setting = setting
-        resistance = _resistance(moduli, drift, strain, setting)
-        return torch.from_numpy(setting.simulator.engine.terms(_array(q), resistance, tangent=False)[1])
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
-        """Derivatives by each input."""
-        q, moduli, drift, strain = ctx.saved_tensors
-        engine = ctx.setting.simulator.engine
-        resistance = _resistance(moduli, drift, strain, ctx.setting)
-        weight = _array(grad)
-        tangents = engine.terms(_array(q), resistance, tangent=True)[2]
-        by_drift = by_strain = None
-        if resistance.damped:
-            by_drift, by_strain = (-by for by in _by_past(engine, _array(q), resistance, weight))
-        by_moduli = -torch.from_numpy(_by_moduli(engine, _array(q), resistance, weight))
-        return torch.from_numpy(engine.multiply(tangents, weight)), by_moduli, by_drift, by_strain, None
-
-
 def _array(tensor: Tensor) -> np.ndarray:
     return np.ascontiguousarray(tensor.detach().numpy())
 

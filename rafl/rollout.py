@@ -7,12 +7,15 @@ import torch
 from torch import Tensor
 
 from rafl.errors import SimulationError
-from rafl.implicit import InternalForce, Minimum, Setting
-from rafl.integrator import INTEGRATORS, Problem, State, green_strain
+from rafl.implicit import Minimum, Setting
+from rafl.integrator import INTEGRATORS, ImplicitEuler, Problem, State, green_strain
 from rafl.parameters import Parameters
 from rafl.simulator import Simulator
 
 ResidualForce = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+FIRST_SHARE = 0.25  # of a step, over which the first acceleration is taken
 
 
 @dataclass(frozen=True)
@@ -63,19 +66,19 @@ class _Body:
         mesh, points = self.simulator.mesh, self.simulator.engine.integration.points
         return green_strain(state.q, state.v, torch.from_numpy(mesh.hexes), torch.from_numpy(points.gradient))
 
-    def acceleration(self, q: Tensor, v: Tensor, force: Tensor) -> Tensor:
-        """What the free nodes start with under `force`, gravity included [m/s^2], (B, N, 3)."""
-        alpha = self.parameters.mass_damping.expand(len(q))[:, None, None]
-        drift = strain = None
-        if self.parameters.damped:
-            state = State(q, v, torch.zeros_like(q))
-            at_rest, change = self._strains(state)
-            drift, strain = q - v, at_rest - change
-        inner = InternalForce.apply(q, self.moduli, drift, strain, Setting(self.simulator, None))
-        a = (force - inner) / self.mass[..., None] - alpha * v
-        free = torch.ones(q.shape[1], 1, dtype=torch.float64)
+    def acceleration(self, state: State, force: Tensor, alpha: Tensor, held: Tensor, short: float) -> Tensor:
+        """What the free nodes start with under `force`, gravity included [m/s^2], (B, N, 3).
+
+        Taken over a short time [s] by backward differences, at whose end the held nodes are at `held` (B, F, 3): where
+        a body is let go forces jump, and would throw its stiffest modes farther than a whole step could take back.
+        """
+        problem = ImplicitEuler().problem(state, self.mass, alpha, short)
+        drift, strain = self.past(state, problem)
+        setting = Setting(self.simulator, problem.guess, problem.rate, problem.strain_rate, "first acceleration")
+        x = Minimum.apply(problem.target, problem.inertia, force, held, self.moduli, drift, strain, setting)
+        free = torch.ones(state.q.shape[1], 1, dtype=torch.float64)
         free[torch.from_numpy(self.simulator.fixed)] = 0.0
-        return a * free
+        return free * ((x - state.q) / short - state.v) / short
 
 
 def rollout(
@@ -120,9 +123,11 @@ def rollout(
         if residual is not None:
             forces.append(residual(state.q, state.v, external))
             force = external + forces[-1]
-        if step == 0 and integrator.uses_acceleration:
-            state = State(state.q, state.v, body.acceleration(state.q, state.v, force))
         begin = state.q[:, fixed]
+        if step == 0 and integrator.uses_acceleration:
+            share = FIRST_SHARE / simulator.substeps
+            held = begin if clamp is None else (1.0 - share) * begin + share * clamp[0]
+            state = State(state.q, state.v, body.acceleration(state, force, alpha, held, FIRST_SHARE * h))
         for substep in range(simulator.substeps):
             problem = integrator.problem(state, body.mass, alpha, h)
             held = begin

@@ -6,11 +6,11 @@ from torch import Tensor
 
 from rafl.errors import SimulationError
 from rafl.integrator import INTEGRATORS as INTEGRATOR_OF
-from rafl.integrator import State
+from rafl.integrator import Integrator, State
 from rafl.laws import LAWS
 from rafl.material import Material
 from rafl.mesh import HexMesh
-from rafl.rollout import Start, equilibrium, rollout
+from rafl.rollout import FIRST_SHARE, Start, _Body, equilibrium, rollout
 from rafl.simulator import Simulator
 
 MESH = HexMesh.box((2, 1, 1), (0.04, 0.02, 0.02))
@@ -142,17 +142,9 @@ def test_the_adjoint_is_the_transpose_of_the_derivative(integrator: str, random:
     def tangents(x: Tensor) -> np.ndarray:
         return engine.terms(x.detach().numpy(), resistance, tangent=True)[2]
 
-    total = float((weights[0] * dq).sum())
-    change = State(dq, dv, torch.zeros_like(dq))
-    if stepping.uses_acceleration:
-        start = (df - torch.from_numpy(engine.multiply(tangents(q), dq.numpy()))) / mass[..., None]
-        start[:, held] = 0.0
-        change = State(dq, dv, start)
-    before = positions[0]
-    for step in range(steps):
-        after = positions[step + 1]
-        x = before + stepping.fraction * (after - before)  # where the step's equation holds
-        problem = stepping.problem(change, mass, none, simulator.time_step)
+    def solved(stepping: Integrator, change: State, x: Tensor, h: float) -> Tensor:
+        """The change of a step's solution x by that of the state before it."""
+        problem = stepping.problem(change, mass, none, h)
         moved = torch.zeros_like(dq)
         moved[:, held] = change.q[:, held]
         pulled = torch.from_numpy(engine.multiply(tangents(x), moved.numpy()))
@@ -160,7 +152,23 @@ def test_the_adjoint_is_the_transpose_of_the_derivative(integrator: str, random:
         diagonal = np.repeat(problem.inertia.numpy(), 3, axis=1)[:, free]
         flat = moved.reshape(2, -1)
         flat[:, free] = torch.from_numpy(engine.solve_once(tangents(x), diagonal, right[:, None])[:, 0])
-        change = stepping.advance(change, flat.reshape(dq.shape), simulator.time_step)
+        return flat.reshape(dq.shape)
+
+    total, h = float((weights[0] * dq).sum()), simulator.time_step
+    change = State(dq, dv, torch.zeros_like(dq))
+    if stepping.uses_acceleration:
+        short, body = FIRST_SHARE * h, _Body.of(simulator, None, none.expand(2, 12))
+        first = body.acceleration(State(q, v, torch.zeros_like(q)), force + body.weight, none, q[:, held], short)
+        first[:, held] = -v[:, held] / short
+        x = solved(INTEGRATOR_OF["implicit-euler"], change, q + short * v + short**2 * first, short)
+        start = ((x - dq) / short - dv) / short
+        start[:, held] = 0.0
+        change = State(dq, dv, start)
+    before = positions[0]
+    for step in range(steps):
+        after = positions[step + 1]
+        x = before + stepping.fraction * (after - before)  # where the step's equation holds
+        change = stepping.advance(change, solved(stepping, change, x, h), h)
         total += float((weights[step + 1] * change.q).sum())
         before = after
     assert total == pytest.approx(transposed, rel=1e-9)
