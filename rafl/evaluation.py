@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.dataset import SPLITS, Dataset
+from rafl.errors import SimulationError
 from rafl.mesh import HexMesh
 from rafl.objective import Recordings, frame_errors
 from rafl.oscillation import liveliest, oscillation, resting_error
@@ -89,6 +90,27 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
             )
         )
     return result
+
+
+def compare_those_that_simulate(
+    dataset: Dataset, models: dict[str, FittedModel]
+) -> tuple[list[Comparison], dict[str, SimulationError]]:
+    """`compare`, and by model why a simulation with it fails, where one does.
+
+    Raises:
+        SimulationError: a rollout of the untouched simulator failed.
+        InputError: a model that does not act on this mesh.
+    """
+    try:
+        return compare(dataset, models), {}
+    except SimulationError:
+        failures: dict[str, SimulationError] = {}
+        for name, model in models.items():
+            try:
+                compare(dataset, {name: model})
+            except SimulationError as error:
+                failures[name] = error
+    return compare(dataset, {name: models[name] for name in models if name not in failures}), failures
 
 
 def error_table(comparisons: list[Comparison]) -> pd.DataFrame:

@@ -21,6 +21,7 @@ from rafl.dataset import Dataset
 from rafl.dataset_file import write_dataset
 from rafl.global_residual import GlobalResidual
 from rafl.mesh import HexMesh
+from rafl.residual import ResidualField
 from rafl.run import FittedModel, save_model
 from rafl.synthetic import released
 
@@ -283,6 +284,28 @@ def test_a_model_of_another_mesh_is_left_out_and_a_model_of_none_refused(
     assert re.search(r"srl: worse than the original simulator on \d of 1 datasets", said.stdout)
     assert re.search(r"held-out marker error: original [\d.]+ mm, sysid [\d.]+ mm", said.stdout)
     assert not (tmp_path / "run" / "errors.csv").exists()
+
+
+def test_a_model_whose_simulation_fails_is_left_out_there_and_said(built: Dataset, run: Run, tmp_path: Path) -> None:
+    """The others are compared all the same."""
+    write_dataset(tmp_path / "small.h5", built)
+    still = replace(built.simulator, gravity=(0.0, 0.0, 0.0))
+    write_dataset(tmp_path / "still.h5", released("still", still, still, still.mesh.vertices[None], 3, {"a": "test"}))
+    field = ResidualField()
+    field.load_state_dict({key: 30.0 * value for key, value in field.state_dict().items()})
+    save_model(tmp_path / "wild", FittedModel("rafl", field=field))
+    save_model(tmp_path / "good", FittedModel("sysid-e", material={"youngs_modulus": 190e3, "poissons_ratio": 0.45}))
+    said = run("rafl-eval", "wild", "small.h5")
+    assert said.returncode == 1
+    assert "error: rafl on small: step 1" in said.stderr
+    assert not (tmp_path / "wild" / "errors.csv").exists()
+    said = run("rafl-eval", "good", "wild", "small.h5", "still.h5")
+    assert said.returncode == 0, said.stderr
+    assert "left out on small: rafl" in said.stderr
+    assert re.search(
+        r"rafl: worse than the original simulator on \d of 1 datasets; its simulation fails on 1 more", said.stdout
+    )
+    assert (tmp_path / "good" / "report.html").exists()
 
 
 def test_render_refuses(specimen_file: Path, run: Run, tmp_path: Path) -> None:

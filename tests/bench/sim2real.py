@@ -27,8 +27,7 @@ from capture.specimen import Specimen, read_specimen
 from groundwork import progress, write_text
 from rafl.dataset import Dataset
 from rafl.dataset_file import read_dataset
-from rafl.errors import SimulationError
-from rafl.evaluation import ORIGINAL, compare, latex_table, split_table
+from rafl.evaluation import ORIGINAL, compare_those_that_simulate, latex_table, split_table
 from rafl.material import Material
 from rafl.mesh import HexMesh
 from rafl.run import FittedModel, load_model
@@ -219,14 +218,11 @@ class Study:
 
 def test_errors(dataset: Dataset, models: dict[str, FittedModel]) -> pd.DataFrame:
     """Errors by method; infinite where a model lets a simulation fail."""
-    try:
-        return split_table(compare(dataset, models))
-    except SimulationError as error:
-        if len(models) > 1:
-            return pd.concat([test_errors(dataset, {name: model}) for name, model in models.items()])
-        print(f"{dataset.name}, {next(iter(models))}: {error}")
-        failed = {"dataset": dataset.name, "split": "test", "method": next(iter(models)), "mean_mm": np.inf}
-        return pd.concat([split_table(compare(dataset, {})), pd.DataFrame([failed])])
+    compared, failures = compare_those_that_simulate(dataset, models)
+    for name, error in failures.items():
+        print(f"{dataset.name}, {name}: {error}")
+    failed = [{"dataset": dataset.name, "split": "test", "method": name, "mean_mm": np.inf} for name in failures]
+    return pd.concat([split_table(compared), pd.DataFrame(failed)])
 
 
 def show(title: str, table: pd.DataFrame) -> None:
