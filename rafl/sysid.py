@@ -30,6 +30,7 @@ ROUNDS = 3  # iterations with each of these
 STRIDE = 0.2  # of a variable: the first step
 NORMAL = 1.959964  # 95 % of a normal distribution lie within as many standard deviations
 WALL = 1e6  # the loss where a simulation fails
+TINY = 1e-30  # a loss that is none
 STEP = 1e-3  # of a variable, for the curvature's finite differences of the exact gradient
 
 
@@ -179,7 +180,7 @@ class _Search:
 
     def descend(self, start: Array, iterations: int) -> tuple[float, Array]:
         """L-BFGS-B from a start; the loss reached, and where."""
-        scale = self(start)[0]
+        scale = max(self(start)[0], TINY)
 
         def relative(y: Array) -> tuple[float, Array]:
             loss, slope = self(y * STRIDE)

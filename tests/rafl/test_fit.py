@@ -179,6 +179,21 @@ def test_a_fit_beside_what_cannot_be_simulated_is_kept(
     assert "no interval" in spoken(pd.read_csv(tmp_path / "parameters.csv"))[0]
 
 
+def test_a_material_that_explains_all_is_kept(dataset: Dataset, tmp_path: Path) -> None:
+    """Nothing to gain, and nothing to divide by."""
+    still = {
+        name: replace(
+            item, markers=np.broadcast_to(dataset.markers.rest, item.markers.shape), q=dataset.simulator.mesh.vertices
+        )
+        for name, item in dataset.trajectories.items()
+    }
+    simulator = replace(dataset.simulator, gravity=(0.0, 0.0, 0.0))
+    settings = replace(SETTINGS, method="sysid-e", epochs=1)
+    exact = replace(dataset, trajectories=still, simulator=simulator)
+    model = identify_material([exact], settings, tmp_path, silent)
+    assert mean_error(validation_batches([exact]), model) < 1e-9
+
+
 def test_trading_off_is_said() -> None:
     table = pd.DataFrame(
         {
