@@ -24,13 +24,12 @@ from rafl.evaluation import (
     motion_table,
     split_table,
 )
-from rafl.fit import prepared
+from rafl.fit import nothing_to_follow
 from rafl.methods import EPOCHS, METHODS, check_inputs
 from rafl.processes import process_count, rank
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
 from rafl.sysid import spoken
-from rafl.targets import can_be_followed
 
 # The network is small; the other core serves the element kernels.
 TORCH_THREADS = 1
@@ -109,8 +108,7 @@ def fit(
         _open_run(run, settings, resume)
         if process_count() > batch:
             typer.echo(f"{process_count()} processes share out {batch}: give --batch to use them all", err=True)
-        taught = [can_be_followed(dataset.simulator) for dataset in prepared(loaded, settings)]
-        if method == "rafl" and warm_start and not start and not any(taught):
+        if method == "rafl" and nothing_to_follow(loaded, settings):
             typer.echo("no warm start: it needs implicit-euler, one substep and no viscosity", err=True)
     writer = open_writer(run) if open_writer and first else None
     with progress() as bar:

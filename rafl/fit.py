@@ -28,6 +28,7 @@ from rafl.run import (
     stale,
     write_history,
 )
+from rafl.targets import can_be_followed
 from rafl.warm_start import warm_start
 
 GRADIENT_LIMIT = 10.0  # Adam's step does not depend on the size; a diverging rollout's must not enter its memory
@@ -132,6 +133,15 @@ def _corrected(dataset: Dataset, start: FittedModel, stepping: bool) -> Dataset:
     values: dict[str, Any] = dict(start.material or {})
     simulator = start.simulator(dataset.simulator) if stepping else dataset.simulator
     return replace(dataset, simulator=replace(simulator, material=replace(simulator.material, **values)))
+
+
+def nothing_to_follow(datasets: list[Dataset], settings: Settings) -> bool:
+    """Whether a warm start is wanted that no dataset's simulator, as it will be trained with, can give."""
+    start = model_to_go_on_from(Path(settings.start)) if settings.start else FittedModel("rafl")
+    if settings.warm_start == 0 or start.field is not None:
+        return False
+    used = (_corrected(dataset, start, stepping=not settings.integrator) for dataset in prepared(datasets, settings))
+    return not any(can_be_followed(dataset.simulator) for dataset in used)
 
 
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:

@@ -12,6 +12,7 @@ import yaml
 
 from groundwork import InputError, check_format, require_file, whole_file, write_text
 from rafl.global_residual import GlobalResidual
+from rafl.integrator import INTEGRATORS
 from rafl.parameters import Parameters
 from rafl.residual import ResidualField
 from rafl.rollout import ResidualForce
@@ -163,6 +164,11 @@ def load_model(run: Path) -> FittedModel:
     material = content.get("material")
     if not (material is None or isinstance(material, dict)):
         raise InputError(f"expected identified values by name in {run / 'model.pt'}, found a list; fit again")
+    stepping = content.get("stepping")
+    if stepping is not None and not _steps(stepping):
+        raise InputError(
+            f"expected an integrator and substeps in {run / 'model.pt'}, found {stepping!r:.80}; fit again"
+        )
     network = field = None
     if "network" in content:
         network = GlobalResidual(content["nodes"])
@@ -170,7 +176,14 @@ def load_model(run: Path) -> FittedModel:
     if "field" in content:
         field = ResidualField()
         field.load_state_dict(content["field"])
-    return FittedModel(content["method"], field, material, network, content.get("stepping"))
+    return FittedModel(content["method"], field, material, network, stepping)
+
+
+def _steps(found: Any) -> bool:
+    """Whether this is what `Simulator.stepping` says."""
+    if not (isinstance(found, dict) and set(found) == {"integrator", "substeps"}):
+        return False
+    return found["integrator"] in INTEGRATORS and isinstance(found["substeps"], int) and found["substeps"] >= 1
 
 
 def stale(errors: Sequence[float], patience: int) -> bool:

@@ -295,6 +295,8 @@ def test_a_model_whose_simulation_fails_is_left_out_there_and_said(built: Datase
     field.load_state_dict({key: 30.0 * value for key, value in field.state_dict().items()})
     save_model(tmp_path / "wild", FittedModel("rafl", field=field))
     save_model(tmp_path / "good", FittedModel("sysid-e", material={"youngs_modulus": 190e3, "poissons_ratio": 0.45}))
+    save_model(tmp_path / "odd", FittedModel("rafl", field=field, stepping={"integrator": "magic", "substeps": 1}))
+    assert_refused(run("rafl-eval", "odd", "small.h5"), "model.pt", "integrator", "magic")
     said = run("rafl-eval", "wild", "small.h5")
     assert said.returncode == 1
     assert "error: rafl on small: step 1" in said.stderr

@@ -11,7 +11,7 @@ from rafl import fit
 from rafl.dataset import Dataset
 from rafl.errors import SimulationError
 from rafl.evaluation import compare
-from rafl.fit import fit_residual_field, mean_error, training_items, validation_batches
+from rafl.fit import fit_residual_field, mean_error, nothing_to_follow, training_items, validation_batches
 from rafl.mesh import HexMesh
 from rafl.objective import Recordings
 from rafl.run import FittedModel, Settings, load_model
@@ -102,6 +102,8 @@ def test_a_model_steps_as_it_was_fitted(dataset: Dataset, tmp_path: Path) -> Non
     settings = replace(SETTINGS, epochs=1, frames=0, start=str(tmp_path / "a"))
     corrected = fit_residual_field([dataset], settings, tmp_path / "b", rows.append)
     assert corrected.stepping == identified.stepping
+    assert nothing_to_follow([dataset], replace(settings, warm_start=3))
+    assert not nothing_to_follow([dataset], replace(settings, warm_start=3, start=""))
     untrained = 1e3 * mean_error(validation_batches([dataset]), identified)
     assert rows[0]["validation_mm"] == pytest.approx(untrained, rel=0.05)  # the new field is nearly none
 
