@@ -13,10 +13,11 @@ from groundwork import InputError
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, eight_bits, find_spots, fit_dots, start_of
 from tracking.family import Family, find_family
+from tracking.frame import Frame
 from tracking.newcomers import Newcomer, Newcomers
 from tracking.noise import with_coding_errors, with_shared_errors
 from tracking.shape import Pattern, carry, recognise
-from tracking.video import Frame, Video
+from tracking.video import Video
 
 Array = NDArray[Any]
 
@@ -77,7 +78,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     for frame in reading:
         times.append(frame.time)
         damaged.append(frame.picture is None)
-        sight = Sight(NOTHING, NOTHING, NOTHING)
+        sight = Sight(NOTHING, NOTHING, NOTHING, NOTHING[:, 0])
         if frame.picture is not None and tracker is None:
             found = find_family(frame.picture)
             most = max(most, 0 if found is None else len(found[1]))
@@ -100,8 +101,8 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
             f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in a frame, found {most} at most; "
             "check that dots of 3 to 32 px radius contrast with the skin"
         )
-    paths, fitted, coded = _whole(seen, late, len(tracker.pattern.rest))
-    sigma = with_coding_errors(paths, with_shared_errors(paths, fitted), coded)
+    paths, fitted, leverage, step = _whole(seen, late, len(tracker.pattern.rest))
+    sigma = with_coding_errors(paths, with_shared_errors(paths, fitted), leverage, step)
     return PixelTracks(
         np.array(times), paths, sigma, tracker.pattern.rest, len(late), np.array(damaged),
         album.pictures(), tuple(reading.notes),
@@ -115,30 +116,34 @@ class Sight:
     Attributes:
         pixel: (D, 2), NaN where not seen.
         sigma: from the fits [px], (D, 2), NaN where not seen.
-        coded: the centre's error if the video's coding left independent errors of one step in each pixel [px], (D, 2).
+        leverage: what a grey level of independent noise in every pixel moves the centre by [px], (D, 2).
+        step: by which the video's coding rounded the picture there [grey levels], (D), NaN where not known.
     """
 
     pixel: Array
     sigma: Array
-    coded: Array
+    leverage: Array
+    step: Array
 
     @classmethod
     def of(cls, dots: Dots, frame: Frame) -> "Sight":
         """Those of a frame; dots without a sigma are not seen."""
         pixel = np.where(np.isfinite(dots.sigma), dots.centre, np.nan)
-        return cls(pixel, dots.sigma, dots.leverage * frame.step_at(pixel)[:, None])
+        return cls(pixel, dots.sigma, dots.leverage, frame.step_at(pixel))
 
 
-def _whole(seen: list[Sight], late: list[Newcomer], count: int) -> tuple[Array, Array, Array]:
-    """Pixels, sigma and coding errors (T, D, 2) of all markers, NaN where not seen; the last are the late ones."""
-    paths, fitted, coded = np.full((3, len(seen), count, 2), np.nan)
+def _whole(seen: list[Sight], late: list[Newcomer], count: int) -> tuple[Array, Array, Array, Array]:
+    """Pixels, sigma, leverage (T, D, 2) and steps (T, D) of all markers, NaN where not seen; the last come late."""
+    paths, fitted, leverage = np.full((3, len(seen), count, 2), np.nan)
+    step = np.full((len(seen), count), np.nan)
     for frame, sight in enumerate(seen):
         known = len(sight.pixel)
-        paths[frame, :known], fitted[frame, :known], coded[frame, :known] = sight.pixel, sight.sigma, sight.coded
+        paths[frame, :known], fitted[frame, :known] = sight.pixel, sight.sigma
+        leverage[frame, :known], step[frame, :known] = sight.leverage, sight.step
     for column, newcomer in enumerate(late, start=count - len(late)):
         for frame, (pixel, sigma) in newcomer.seen.items():
             paths[frame, column], fitted[frame, column] = pixel, sigma
-    return paths, fitted, coded
+    return paths, fitted, leverage, step
 
 
 class _Album:

@@ -59,7 +59,7 @@ def with_shared_errors(pixel: Array, sigma: Array) -> Array:
     return np.sqrt(sigma**2 + added)
 
 
-def with_coding_errors(pixel: Array, sigma: Array, coded: Array) -> Array:
+def with_coding_errors(pixel: Array, sigma: Array, leverage: Array, step: Array) -> Array:
     """Standard deviations (T, D, 2) no smaller than what the coding of the pictures leads one to expect.
 
     An encoder passes over changes below its step: a dot that moves a little stays where it was, and the picture it
@@ -68,9 +68,14 @@ def with_coding_errors(pixel: Array, sigma: Array, coded: Array) -> Array:
     Args:
         pixel: paths [px], (T, D, 2), NaN where not seen.
         sigma: so far [px], (T, D, 2).
-        coded: errors that independent errors of one step would make [px], (T, D, 2); NaN where not known.
+        leverage: what a grey level of independent noise in every pixel moves a centre by [px], (T, D, 2), NaN where
+            not known.
+        step: by which the picture was rounded there [grey levels], (T, D), NaN where not known: as in other frames.
     """
-    still = STILL * np.nan_to_num(coded)
+    told = np.isfinite(step)
+    square = np.nansum(step**2, axis=0) / np.maximum(told.sum(axis=0), 1)
+    usual = np.where(told.any(axis=0), square, np.nansum(step**2) / max(told.sum(), 1)) ** 0.5
+    still = STILL * np.nan_to_num(leverage * np.where(told, step, usual)[..., None])
     count = np.maximum(np.isfinite(pixel).sum(axis=0), 1)
     mean = np.nansum(pixel, axis=0) / count
     spread = np.nansum((pixel - mean) ** 2, axis=0) / count

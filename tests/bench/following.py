@@ -16,7 +16,8 @@ from motions import Beam, random_beam
 from tracking.artificial import Scene, draw, expose
 from tracking.fill import fill_gaps
 from tracking.follow import follow
-from tracking.video import Frame, Reading, Video, open_video
+from tracking.frame import Frame
+from tracking.video import Reading, Video, open_video
 
 
 @dataclass(frozen=True)

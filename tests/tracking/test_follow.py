@@ -10,7 +10,8 @@ from support import picture
 from groundwork import InputError
 from tracking.family import find_family
 from tracking.follow import Tracker, follow
-from tracking.video import Frame, Reading
+from tracking.frame import Frame
+from tracking.video import Reading
 
 SIZE = (360, 240)
 

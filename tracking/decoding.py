@@ -1,0 +1,294 @@
+"""Frames out of a video file, decoded packet by packet; what is damaged is left out."""
+
+import heapq
+import logging
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import av
+import numpy as np
+from av.sidedata.sidedata import Type as SideData
+from numpy.typing import NDArray
+
+from groundwork import InputError
+from tracking.frame import MACROBLOCK, Frame, scaled
+
+# Decoders tell of damage in their log, the same words again for the next packet; what nobody listens to is nobody's
+# business.
+av.logging.set_level(av.logging.ERROR)
+av.logging.set_skip_repeated(False)
+logging.getLogger("libav").addHandler(logging.NullHandler())
+logging.getLogger("libav").propagate = False
+# What makes FFmpeg's decoders report damage instead of painting over it, and how coarsely a picture was coded.
+STRICT = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data": "venc_params"}
+H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
+# Frames of which one is asked how it was coded: kinds of frames come in fours and twelves. Its side data and a frame
+# hold on to each other until Python's collector passes, and a decoder that has to take fresh memory is a third slower.
+ASKED = 7
+
+
+def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Iterator[Frame]:
+    """Every frame of a video file in order; damaged ones, and those that refer to them, without a picture.
+
+    Decodes in one thread, which is what makes a decoder own up to damage.
+
+    Args:
+        path: of the file.
+        frames: how many the container announces; 0 where it does not.
+        fps: frames per second that it announces; 0 where it does not.
+        notes: is added what contradicts itself.
+
+    Raises:
+        InputError: nothing decodes.
+    """
+    shown: list[float] = []
+    try:
+        with av.open(str(path)) as container:
+            for frame in _frames(container, notes):
+                shown.append(frame.time)
+                yield frame
+    except (av.FFmpegError, OSError) as error:
+        if not shown:
+            raise InputError(
+                f"{path}: no frame can be decoded ({error}); copy the video again from the camera"
+            ) from None
+        notes.append(f"{path.name}: reading stopped after frame {len(shown) - 1} ({error})")
+    if not shown:
+        raise InputError(f"expected frames in {path}, found none; copy the video again from the camera")
+    notes += _contradictions(path.name, frames, fps, np.array(shown))
+
+
+def _frames(container: "av.container.InputContainer", notes: list[str]) -> Iterator[Frame]:
+    stream = container.streams.video[0]
+    stream.thread_type = "NONE"
+    stream.codec_context.thread_count = 1
+    stream.codec_context.options = STRICT
+    assert stream.time_base is not None
+    tells = stream.codec_context.name == "h264"
+    order = _Order(float(stream.time_base))
+    number = 0
+    shape: tuple[int, ...] | None = None
+    for packet in _packets(container, stream, notes):
+        order.expect(packet)
+        frames, trouble = _decoded(packet)
+        if trouble:
+            order.spoil(packet.pts)
+        for frame in frames:
+            picture = None if frame.is_corrupt else _grey(frame)
+            if shape is None and picture is not None:
+                shape = picture.shape
+            if picture is None or picture.shape != shape:  # damage may turn pictures, too
+                order.spoil(frame.pts)
+            steps = _steps(frame) if tells and number % ASKED == 0 else None
+            yield from order.shown(_Decoded(frame.pts, picture, steps))
+            number += 1
+    yield from order.rest()
+
+
+@dataclass(frozen=True)
+class _Decoded:
+    """A frame as it comes out of the decoder."""
+
+    stamp: int | None
+    picture: NDArray | None
+    steps: NDArray | None
+
+
+@dataclass(frozen=True)
+class _Packet:
+    """Where a frame stands among the others.
+
+    Attributes:
+        number: in the order of decoding.
+        group: key frames up to and with this one.
+        leading: shown before the key frame of its group, so that it may refer to the group before.
+        last: the latest time stamp of all that were decoded up to it.
+    """
+
+    number: int
+    group: int
+    leading: bool
+    last: int
+
+
+@dataclass
+class _Order:
+    """Puts frames into the order in which they are shown, each in its slot.
+
+    Every packet has a slot by its time stamp. A frame that comes out of the decoder fills its own; slots before it
+    that are still empty were lost. A damaged frame spoils those of its group that were decoded after it. Some decoders
+    own up to damage only when the frame comes out, and frames that refer to it may be shown before it: none is given
+    on before all that were decoded before it are out.
+    """
+
+    base: float
+    packets: dict[int, _Packet] = field(default_factory=dict)
+    waiting: list[int] = field(default_factory=list)
+    held: deque[_Decoded] = field(default_factory=deque)
+    broken: dict[int, int] = field(default_factory=dict)  # by group, the first damaged packet
+    count: int = 0
+    group: int = 0
+    key: int | None = None
+    last: int | None = None  # latest stamp of all packets
+    start: int | None = None
+
+    def expect(self, packet: "av.packet.Packet") -> None:
+        """Takes note of a packet that is about to be decoded."""
+        stamp = packet.pts
+        if packet.is_keyframe:
+            self.group += 1
+            self.key = stamp
+        self.count += 1
+        if packet.size and stamp is not None:
+            self.last = stamp if self.last is None else max(self.last, stamp)
+            leading = self.key is not None and stamp < self.key
+            self.packets[stamp] = _Packet(self.count, self.group, leading, self.last)
+            heapq.heappush(self.waiting, stamp)
+
+    def spoil(self, stamp: int | None) -> None:
+        """What is stamped so is damaged; without a stamp, what was decoded last."""
+        packet = None if stamp is None else self.packets.get(stamp)
+        number, group = (self.count, self.group) if packet is None else (packet.number, packet.group)
+        self.broken[group] = min(number, self.broken.get(group, number))
+
+    def shown(self, frame: _Decoded) -> Iterator[Frame]:
+        """The frames that can be given on once this one is out."""
+        self.held.append(frame)
+        while self.held and self._is_ready(self.held[0], frame.stamp):
+            yield from self._given_on(self.held.popleft())
+
+    def rest(self) -> Iterator[Frame]:
+        """All that is left when the decoder is empty."""
+        while self.held:
+            yield from self._given_on(self.held.popleft())
+        yield from self._lost(None)
+
+    def _is_ready(self, frame: _Decoded, out: int | None) -> bool:
+        packet = None if frame.stamp is None else self.packets.get(frame.stamp)
+        return packet is None or out is None or packet.last <= out
+
+    def _given_on(self, frame: _Decoded) -> Iterator[Frame]:
+        if frame.stamp is None:
+            sound = self.group not in self.broken
+            yield Frame(np.nan, frame.picture if sound else None, frame.steps if sound else None)
+            return
+        yield from self._lost(frame.stamp)
+        sound = self._is_sound(self.packets.pop(frame.stamp, None))
+        yield Frame(self._time(frame.stamp), frame.picture if sound else None, frame.steps if sound else None)
+
+    def _is_sound(self, packet: _Packet | None) -> bool:
+        if packet is None:
+            return self.group not in self.broken
+        if packet.leading and packet.group - 1 in self.broken:
+            return False
+        return packet.number < self.broken.get(packet.group, packet.number + 1)
+
+    def _lost(self, stamp: int | None) -> Iterator[Frame]:
+        """The slots before `stamp`, or all that are left."""
+        while self.waiting and (stamp is None or self.waiting[0] < stamp):
+            lost = heapq.heappop(self.waiting)
+            self.packets.pop(lost, None)
+            yield Frame(self._time(lost), None)
+        if self.waiting and self.waiting[0] == stamp:
+            heapq.heappop(self.waiting)
+
+    def _time(self, stamp: int) -> float:
+        if self.start is None:
+            self.start = stamp
+        return (stamp - self.start) * self.base
+
+
+def _packets(
+    container: "av.container.InputContainer", stream: "av.video.stream.VideoStream", notes: list[str]
+) -> Iterator["av.packet.Packet"]:
+    """The stream's packets; where the file breaks off, what came before and a note."""
+    packets = container.demux(stream)
+    while True:
+        try:
+            packet = next(packets)
+        except StopIteration:
+            return
+        except (av.FFmpegError, OSError) as error:
+            notes.append(f"{container.name}: the file breaks off or is damaged ({error})")
+            return
+        yield packet
+
+
+def _decoded(packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
+    """A packet's frames, and whether the decoder complained."""
+    with av.logging.Capture(local=True) as messages:
+        try:
+            frames = packet.decode()
+        except av.FFmpegError:
+            return [], True
+    complaints = any(level <= av.logging.ERROR for level, _, _ in messages)
+    return frames, complaints or packet.is_corrupt
+
+
+def _contradictions(name: str, frames: int, fps: float, time: NDArray) -> list[str]:
+    """What the container says that its frames do not bear out."""
+    notes = []
+    if frames and frames != len(time):
+        notes.append(f"{name}: the file announces {frames} frames and holds {len(time)}")
+    step = np.diff(time[np.isfinite(time)])
+    if len(step) and (step <= 0).any():
+        notes.append(f"{name}: {int((step <= 0).sum())} frames are stamped no later than the one before")
+    elif len(step) > 1 and fps:
+        rate = 1.0 / float(np.median(step))
+        if abs(rate / fps - 1.0) > 0.02:
+            notes.append(
+                f"{name}: the file announces {fps:.6g} frames/s, its time stamps {rate:.6g}; the time stamps are used"
+            )
+        gaps = int((step > 1.5 * np.median(step)).sum())
+        if gaps:
+            notes.append(f"{name}: {gaps} gaps in the time stamps, where frames were dropped")
+    return notes
+
+
+def quarter_turns(frame: "av.VideoFrame") -> int:
+    """How many quarter turns anticlockwise a frame asks to be shown by."""
+    return round(frame.rotation / 90.0) % 4
+
+
+def _grey(frame: "av.VideoFrame") -> NDArray:
+    """The luma plane as it is stored, or the grey of a format without one, turned as it is to be shown."""
+    name, bits = frame.format.name, frame.format.components[0].bits
+    planar = name.startswith(("yuv4", "yuvj4", "gray", "nv1", "nv2", "p01", "p21", "yuva4")) and not name.endswith("be")
+    if planar and bits <= 16 and not name.startswith("grayf"):
+        plane = frame.planes[0]
+        kind = np.uint8 if bits == 8 else np.uint16
+        rows = np.frombuffer(plane, kind).reshape(plane.height, -1)[:, : plane.width]
+        # p010 and its like keep their bits at the upper end.
+        high = name.startswith(("p01", "p21"))
+        picture = rows.copy() if bits == 8 else scaled(rows, 16 if high else bits)
+    elif bits > 8:
+        picture = scaled(frame.to_ndarray(format="gray16le"), 16)
+    else:
+        picture = frame.to_ndarray(format="gray")
+    turns = quarter_turns(frame)
+    return np.ascontiguousarray(np.rot90(picture, turns)) if turns else picture
+
+
+def _steps(frame: "av.VideoFrame") -> NDArray | None:
+    """The steps by which an H.264 picture of 8 bits was rounded, turned as it is to be shown."""
+    if frame.format.components[0].bits != 8:
+        return None
+    rows, columns = (-(-side // MACROBLOCK) for side in (frame.height, frame.width))
+    for data in frame.side_data:
+        if data.type != SideData.VIDEO_ENC_PARAMS:
+            continue
+        # FFmpeg's AVVideoEncParams: count, offset and size of the blocks, kind, quantiser; each block ends in its own.
+        head = np.frombuffer(data, np.int32, 8)
+        count, offset, size, kind, quantiser = (int(head[k]) for k in (0, 2, 4, 6, 7))
+        if kind != H264_PARAMETERS or count != rows * columns or size % 4:
+            continue
+        blocks = np.frombuffer(data, np.int32, count * size // 4, offset).reshape(rows, columns, -1)
+        steps = 0.625 * 2.0 ** ((quantiser + blocks[..., 4]) / 6.0)
+        if turns := quarter_turns(frame):
+            whole = np.kron(steps, np.ones((MACROBLOCK, MACROBLOCK)))[: frame.height, : frame.width]
+            half = MACROBLOCK // 2
+            steps = np.rot90(whole, turns)[half::MACROBLOCK, half::MACROBLOCK]
+        return steps
+    return None

@@ -1,0 +1,38 @@
+"""One frame of a video."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+MACROBLOCK = 16  # px: side of the squares that H.264 codes with one step
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame.
+
+    Attributes:
+        time: since the first frame [s]; NaN where unknown.
+        picture: grey levels of 0 to 255 (H, W), uint8, or float32 where the video has more than 8 bits;
+            None where the frame is damaged.
+        steps: by which H.264 rounded the changes in each square of 16 px [grey levels], (H / 16, W / 16); None in most
+            frames, and where the decoder does not say.
+    """
+
+    time: float
+    picture: NDArray | None
+    steps: NDArray | None = None
+
+    def step_at(self, places: NDArray) -> NDArray:
+        """The steps at places [px], (D, 2); NaN where they are not known, (D)."""
+        if self.steps is None:
+            return np.full(len(places), np.nan)
+        last = np.array(self.steps.shape[::-1]) - 1
+        column, row = np.clip(np.nan_to_num(places) / MACROBLOCK, 0, last).astype(int).T
+        return self.steps[row, column]
+
+
+def scaled(levels: NDArray, bits: int) -> NDArray[np.float32]:
+    """Grey levels of more than 8 bits as those of 0 to 255."""
+    return levels.astype(np.float32) * np.float32(0.5 ** (bits - 8))
