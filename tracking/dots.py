@@ -20,7 +20,8 @@ ROUNDEST = 0.75  # least share of the outline's ellipse that is filled
 LEAST_CONTRAST = 12.0  # grey levels
 LEAST_SIGMA = 1e-3  # px: below it the model's own error counts
 SHARED_NOISE = 1.25  # variance by blocks over that by independent errors, beyond which errors are shared
-ENOUGH_FOR_TWO = 12  # dots, to fit half of them in another thread
+ENOUGH_FOR_TWO = 64  # dots, to fit half of them in another thread; with fewer, decoding takes longer than fitting
+FIGURES = 8  # of a dot, that follow from its fit
 SAME_PLACE = 0.6  # radii: two dots closer than this are one
 SPOT_SHARE = 0.3  # of the markers' contrast: what a spot must stand out by
 
@@ -70,12 +71,13 @@ class Dots:
 
 
 @njit(cache=True, nogil=True)
-def _fit_some(image, start, first, last, fitted, quality):  # type: ignore[no-untyped-def]
-    """Fit starts first to last of start (D, 12); fills fitted (D, 12) and quality (D, QUALITY)."""
+def _fit_some(image, start, first, last, fitted, figures):  # type: ignore[no-untyped-def]
+    """Fit starts first to last of start (D, 12); fills fitted (D, 12) and figures (D, FIGURES)."""
     count = start.shape[0]
     room = np.empty(SCRATCH, np.float32)
     radius = 1.0 / np.sqrt(np.abs(start[:, 2] * start[:, 4] - start[:, 3] ** 2))
     near = np.empty((16, 3))
+    quality = np.empty(QUALITY)
     for k in range(first, last):
         found = 0
         fitted[k] = start[k]
@@ -86,37 +88,50 @@ def _fit_some(image, start, first, last, fitted, quality):  # type: ignore[no-un
                 near[found, 1] = start[other, 1]
                 near[found, 2] = radius[other]
                 found += 1
-        fit_disc(image, fitted[k], near[:found], room, quality[k])
+        fit_disc(image, fitted[k], near[:found], room, quality)
+        _describe(fitted[k], quality, figures[k])
+
+
+@njit(cache=True, nogil=True)
+def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
+    """Fills what `Dots` says of one fit: sigma (2), leverage (2), radius, flattening, residual, share used."""
+    figures[0:2] = np.nan
+    figures[2], figures[3] = np.sqrt(quality[1]), np.sqrt(quality[2])
+    figures[4], figures[5] = np.nan, 0.0
+    figures[6], figures[7] = np.sqrt(quality[5]) / max(abs(p[8]), 1e-12), quality[6]
+    determinant = p[2] * p[4] - p[3] * p[3]
+    mean = 0.5 * (p[2] + p[4])
+    if not (quality[0] > 0.0 and determinant > 0.0 and mean > 0.0):
+        return
+    white_x, white_y = quality[1] * quality[5], quality[2] * quality[5]
+    shared = quality[3] + quality[4] > SHARED_NOISE * (white_x + white_y)
+    figures[0] = np.sqrt((quality[3] if shared else white_x) + LEAST_SIGMA**2)
+    figures[1] = np.sqrt((quality[4] if shared else white_y) + LEAST_SIGMA**2)
+    spread = np.sqrt(max(mean * mean - determinant, 0.0))
+    figures[4] = 1.0 / np.sqrt(determinant)
+    figures[5] = (mean - spread) / (mean + spread)
 
 
 def fit_dots(image: NDArray, start: Array) -> Dots:
     """Fit a disc to every start (D, 12); see `tracking.disc`."""
     start = np.ascontiguousarray(start)
-    fitted, quality = np.empty_like(start), np.zeros((len(start), QUALITY))
+    fitted, figures = np.empty_like(start), np.empty((len(start), FIGURES))
     half = len(start) // 2 if len(start) >= ENOUGH_FOR_TWO else 0
-    other = _POOL.submit(_fit_some, image, start, 0, half, fitted, quality) if half else None
-    _fit_some(image, start, half, len(start), fitted, quality)
+    other = _POOL.submit(_fit_some, image, start, 0, half, fitted, figures) if half else None
+    _fit_some(image, start, half, len(start), fitted, figures)
     if other is not None:
         other.result()
-    determinant = fitted[:, 2] * fitted[:, 4] - fitted[:, 3] ** 2
-    mean = 0.5 * (fitted[:, 2] + fitted[:, 4])
-    spread = np.sqrt(np.maximum(mean**2 - determinant, 0.0))
-    good = (quality[:, 0] > 0) & (determinant > 0) & (mean > 0)
-    leverage, shared = np.sqrt(quality[:, 1:3]), quality[:, 3:5]
-    white = leverage**2 * quality[:, 5:6]
-    variance = np.where(shared.sum(1, keepdims=True) > SHARED_NOISE * white.sum(1, keepdims=True), shared, white)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return Dots(
-            centre=fitted[:, :2],
-            sigma=np.where(good[:, None], np.sqrt(variance + LEAST_SIGMA**2), np.nan),
-            parameters=fitted,
-            radius=np.where(good, determinant, np.nan) ** -0.5,
-            flattening=np.where(good, (mean - spread) / (mean + spread), 0.0),
-            contrast=fitted[:, 8],
-            leverage=leverage,
-            residual=np.sqrt(quality[:, 5]) / np.abs(fitted[:, 8]),
-            used=quality[:, 6],
-        )
+    return Dots(
+        centre=fitted[:, :2],
+        sigma=figures[:, :2],
+        parameters=fitted,
+        radius=figures[:, 4],
+        flattening=figures[:, 5],
+        contrast=fitted[:, 8],
+        leverage=figures[:, 2:4],
+        residual=figures[:, 6],
+        used=figures[:, 7],
+    )
 
 
 def start_of(x: float, y: float, shape: Array, contrast: float, level: float) -> Array:

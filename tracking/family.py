@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from tracking.dots import LEAST_CONTRAST, Dots, find_dots
@@ -28,17 +29,26 @@ class Family:
 
     def admits(self, dots: Dots) -> NDArray[np.bool_]:
         """Which dots could be markers of this family, (D)."""
-        with np.errstate(invalid="ignore"):
-            return (
-                (np.abs(np.log(dots.radius / self.radius)) < np.log(1.35))
-                & (dots.flattening > 0.45)
-                & (dots.contrast / self.contrast > 0.3)
-                & (dots.contrast / self.contrast < 3.0)
-                & (np.abs(dots.contrast) > LEAST_CONTRAST)
-                & (dots.residual < 0.2)
-                & (dots.used > 0.55)
-                & (dots.sigma.max(axis=1) < WORST_SIGMA)
-            )
+        figures = dots.radius, dots.flattening, dots.contrast, dots.residual, dots.used, dots.sigma
+        return _admitted(self.radius, self.contrast, *figures)
+
+
+@njit(cache=True)
+def _admitted(usual_radius, usual_contrast, radius, flattening, contrast, residual, used, sigma):  # type: ignore[no-untyped-def]
+    good = np.empty(len(radius), np.bool_)
+    for k in range(len(radius)):
+        ratio = contrast[k] / usual_contrast
+        good[k] = (
+            abs(np.log(radius[k] / usual_radius)) < np.log(1.35)
+            and flattening[k] > 0.45
+            and 0.3 < ratio < 3.0
+            and abs(contrast[k]) > LEAST_CONTRAST
+            and residual[k] < 0.2
+            and used[k] > 0.55
+            and sigma[k, 0] < WORST_SIGMA
+            and sigma[k, 1] < WORST_SIGMA
+        )
+    return good
 
 
 def _kin(dots: Dots) -> Dots:

@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from groundwork import InputError
@@ -14,6 +15,7 @@ from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, eight_bits, find_spots, fit_dots, start_of
 from tracking.family import Family, find_family
 from tracking.frame import Frame
+from tracking.motion import Motion
 from tracking.newcomers import Newcomer, Newcomers
 from tracking.noise import with_coding_errors, with_shared_errors
 from tracking.shape import Pattern, carry, recognise
@@ -26,8 +28,6 @@ WORST = 10  # frames whose pictures are kept
 CALM = 0.22  # spacings: surprise up to which the dot at a marker's predicted place is its own
 STRAY = 0.33  # spacings: how far from its prediction a dot found there may be
 SEED_REACH = 2.2  # spacings: how far from where it is expected a marker may be
-ORDERS = 4  # of prediction
-FADING = 0.85  # of what was learned of the oscillation, each frame
 RECHECK = 4  # frames between searches for markers out of sight
 NOTHING = np.empty((0, 2))
 
@@ -182,10 +182,8 @@ class Tracker:
         self.family = family
         self.pattern = Pattern.of(first.centre)
         self.parameters = first.parameters.copy()
-        self.believed = [first.centre.copy()]  # the last four frames' positions, newest last
-        self.missing = np.zeros(len(first), dtype=int)  # frames since each was seen
-        self.surprise = np.full(ORDERS, np.inf)  # of predictions of each order [spacings]
-        self.swing = np.zeros(2)  # sums from which the oscillation's stiffness follows
+        self.motion = Motion(first.centre)
+        self.missing = np.zeros(len(first), dtype=np.int64)  # frames since each was seen
         self.searched = 0  # frames since the last search
         self.newcomers = Newcomers(family)
 
@@ -193,7 +191,7 @@ class Tracker:
         """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
         expected = self._expected()
         dots = None
-        if self.surprise.min() < CALM:
+        if self.motion.surprise.min() < CALM:
             dots = self._where_expected(image, expected)
         wanted = self.missing == 0
         self.searched += 1
@@ -207,51 +205,33 @@ class Tracker:
 
     def pass_over(self) -> None:
         """A frame that shows nothing."""
-        self._remember(self._expected())
+        self.motion.remember(self._expected())
         self.missing += 1
 
     def look_out(self, number: int, image: NDArray) -> list[Newcomer]:
         """After `advance`: markers that have become known, followed from now on."""
-        place, seen = self.believed[-1], self.missing == 0
+        place, seen = self.motion.last, self.missing == 0
         found = self.newcomers.look(number, image, place, seen, self.pattern, self.parameters)
         for newcomer in found:
             rest = self.pattern.rest
-            carried = [carry(rest, place, newcomer.rest[None]) for place in self.believed]
-            self.believed = [np.concatenate(pair) for pair in zip(self.believed, carried, strict=True)]
+            places = np.concatenate([carry(rest, place, newcomer.rest[None]) for place in self.motion.places])
+            if number in newcomer.seen:
+                places[-1] = newcomer.seen[number][0]
+            self.motion.join(places)
             self.pattern = Pattern.of(np.concatenate([rest, newcomer.rest[None]]))
             self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
             self.missing = np.append(self.missing, 0 if number in newcomer.seen else 1)
-            if number in newcomer.seen:
-                self.believed[-1][-1] = newcomer.seen[number][0]
         return found
 
     def _patience(self) -> float:
         return RECHECK if (self.missing > 0).any() else np.inf
 
-    def _extrapolated(self, order: int) -> Array:
-        """At rest, at the last velocity, at the last acceleration, or swinging on.
-
-        A free oscillation's acceleration falls by stiffness times velocity; one number serves all markers.
-        """
-        last = self.believed
-        order = min(order, len(last) - 1)
-        if order == 0:
-            return last[-1]
-        velocity = last[-1] - last[-2]
-        if order == 1:
-            return last[-1] + velocity
-        acceleration = velocity - last[-2] + last[-3]
-        if order == 3:
-            stiffness = float(np.clip(self.swing[0] / max(self.swing[1], 1e-12), 0.0, 2.0))
-            acceleration = acceleration - stiffness * velocity
-        return last[-1] + velocity + acceleration
-
     def _expected(self) -> Array:
         """Where the motion so far puts the markers; those out of sight where the others carry them."""
         seen = self.missing == 0
         if not seen.any():
-            return self.believed[-1]
-        expected = self._extrapolated(int(np.argmin(self.surprise)))
+            return self.motion.last
+        expected = self.motion.expected()
         return expected if seen.all() else self.pattern.carried(expected, seen)
 
     def _where_expected(self, image: NDArray, expected: Array) -> Dots | None:
@@ -259,22 +239,10 @@ class Tracker:
         start = self.parameters.copy()
         start[:, :2] = expected
         dots = fit_dots(image, start)
-        away = np.hypot(*(dots.centre - expected).T)
-        good = self.family.admits(dots) & (away < STRAY * self.pattern.spacing)
-        near = away < CALM * self.pattern.spacing
-        change = dots.contrast / self.parameters[:, 8]
-        good &= (change > 0.5) & (change < 2.0)
-        seen = good & (self.missing == 0)
-        if not seen.any() or near[seen].mean() < 0.5:
-            return None
-        good &= ~self._doubled(dots.centre, good)
-        return _only(dots, good)
-
-    def _doubled(self, centre: Array, good: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Which markers share a dot with another."""
-        x, y = np.where(good[:, None], centre, np.nan).T
-        together = (x[:, None] - x) ** 2 + (y[:, None] - y) ** 2 < (SAME_PLACE * self.family.radius) ** 2
-        return together.sum(axis=1) > 1
+        good = self.family.admits(dots)
+        before, same = self.parameters[:, 8], SAME_PLACE * self.family.radius
+        calm = _own(dots.centre, dots.contrast, expected, before, self.missing, self.pattern.spacing, same, good)
+        return _only(dots, good) if calm else None
 
     def _search(self, image: NDArray, expected: Array) -> Dots:
         """Every dot near the body, matched to the markers all at once."""
@@ -291,42 +259,54 @@ class Tracker:
         starts = [start_of(x, y, shape, self.family.contrast, level) for x, y in spots]
         dots = fit_dots(image, np.array(starts).reshape(-1, PARAMETERS))
         dots = apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
-        speed = np.linalg.norm(expected - self.believed[-1], axis=1) / self.pattern.spacing
+        speed = np.linalg.norm(expected - self.motion.last, axis=1) / self.pattern.spacing
         trusted = -speed - 0.2 * np.minimum(self.missing, 10)
-        surprise = float(self.surprise.min())
+        surprise = float(self.motion.surprise.min())
         sureness = 0.0 if hidden else 1.0 / (1.0 + (2.0 * surprise) ** 2) if np.isfinite(surprise) else 0.3
         reach = SEED_REACH * uncertain
-        match = recognise(self.pattern, self.believed[-1], expected, trusted, dots.centre, reach, sureness)
+        match = recognise(self.pattern, self.motion.last, expected, trusted, dots.centre, reach, sureness)
         chosen = dots[np.maximum(match, 0)] if len(dots) else Dots.none(len(match))
         return _only(chosen, match >= 0)
 
     def _learn(self, dots: Dots) -> None:
         seen = np.isfinite(dots.sigma[:, 0])
         was = self.missing == 0
-        both = seen & was
-        if both.any():
-            orders = min(len(self.believed), ORDERS)
-            missed = [dots.centre - self._extrapolated(order) for order in range(orders)]
-            square = np.square(missed).sum(axis=2) / self.pattern.spacing**2
-            now, before = np.sqrt(square[:, both].mean(axis=1)), self.surprise[:orders]
-            self.surprise[:orders] = np.where(np.isfinite(before), np.maximum(now, 0.7 * before), now)
-        else:
-            self.surprise[:] = np.inf
+        self.motion.judge(dots.centre, seen & was, self.pattern.spacing)
         place = dots.centre
         if not seen.all():
             place = np.where(seen[:, None], place, self._expected())
             place = self.pattern.carried(place, seen)
-        self._remember(place)
+        self.motion.remember(place)
         self.missing = np.where(seen, 0, self.missing + 1)
         self.parameters[seen] = dots.parameters[seen]
 
-    def _remember(self, place: Array) -> None:
-        self.believed = [*self.believed[-3:], place]
-        if len(self.believed) == 4:
-            a, b, c, d = self.believed
-            change = d - 3.0 * c + 3.0 * b - a
-            before = c - b
-            self.swing = FADING * self.swing + [-(change * before).sum(), (before**2).sum()]
+
+@njit(cache=True)
+def _own(centre, contrast, expected, before, missing, spacing, same, good):  # type: ignore[no-untyped-def]
+    """Leaves in good (M) the markers whose own dots these are; False where too few lie near their expected places.
+
+    before: contrast in the picture before. same: distance below which two dots are one.
+    """
+    count = len(good)
+    seen = near = 0
+    for k in range(count):
+        away = np.hypot(centre[k, 0] - expected[k, 0], centre[k, 1] - expected[k, 1]) / spacing[k]
+        change = contrast[k] / before[k]
+        good[k] = good[k] and away < STRAY and 0.5 < change < 2.0
+        if good[k] and missing[k] == 0:
+            seen += 1
+            near += away < CALM
+    if 2 * near < seen or seen == 0:
+        return False
+    shared = np.zeros(count, np.bool_)
+    for k in range(count):
+        for other in range(k):
+            if good[k] and good[other]:
+                x, y = centre[k, 0] - centre[other, 0], centre[k, 1] - centre[other, 1]
+                if x * x + y * y < same * same:
+                    shared[k] = shared[other] = True
+    good &= ~shared
+    return True
 
 
 def _only(dots: Dots, good: NDArray[np.bool_]) -> Dots:
