@@ -167,7 +167,7 @@ class Study:
         for shape in BEAMS:
             others = [self.few(other) for other in BEAMS if other != shape]
             model = self.fit(f"without-{shape}", "rafl", others, epochs=self.effort.left_out, warm_start=20)
-            rows += [{**row, "paper_mean_mm": np.nan} for row in self.errors(shape, {"rafl-of-the-others": model})]
+            rows += self.errors(shape, {"rafl-of-the-others": model})
         return pd.DataFrame(rows, columns=COLUMNS)
 
     def seconds(self) -> str:
