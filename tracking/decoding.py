@@ -27,6 +27,9 @@ H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
 # Frames of which one is asked how it was coded: kinds of frames come in fours and twelves. Its side data and a frame
 # hold on to each other until Python's collector passes, and a decoder that has to take fresh memory is a third slower.
 ASKED = 7
+# Decoders that refuse what is damaged, and need not be heard: this one writes dozens of lines a frame into its log, for
+# each of which PyAV waits for Python's lock, though nobody is to see them.
+OPEN = {"mjpeg"}
 
 
 def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Iterator[Frame]:
@@ -66,7 +69,9 @@ def _frames(container: "av.container.InputContainer", notes: list[str]) -> Itera
     stream.codec_context.thread_count = 1
     stream.codec_context.options = STRICT
     assert stream.time_base is not None
-    tells = stream.codec_context.name == "h264"
+    name = stream.codec_context.name
+    tells = name == "h264"
+    av.logging.set_level(None if name in OPEN else av.logging.ERROR)
     order = _Order(float(stream.time_base))
     number = 0
     shape: tuple[int, ...] | None = None

@@ -117,6 +117,7 @@ def test_of_a_cut_file_what_decodes_is_kept(tmp_path: Path) -> None:
     [
         ("a.mkv", "ffv1", "gray", False),
         ("a.mov", "prores_ks", "yuv422p10le", True),
+        ("a.avi", "mjpeg", "yuvj420p", True),
         ("a.mp4", "libx264", "yuv420p", False),
     ],
 )
