@@ -30,6 +30,7 @@ ASKED = 7
 # Decoders that refuse what is damaged, and need not be heard: this one writes dozens of lines a frame into its log, for
 # each of which PyAV waits for Python's lock, though nobody is to see them.
 OPEN = {"mjpeg"}
+DEEPEST = 32  # frames that may be shown before one that they refer to: H.264 and HEVC allow 16
 
 
 def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Iterator[Frame]:
@@ -161,7 +162,7 @@ class _Order:
     def shown(self, frame: _Decoded) -> Iterator[Frame]:
         """The frames that can be given on once this one is out."""
         self.held.append(frame)
-        while self.held and self._is_ready(self.held[0], frame.stamp):
+        while self.held and (len(self.held) > DEEPEST or self._is_ready(self.held[0], frame.stamp)):
             yield from self._given_on(self.held.popleft())
 
     def rest(self) -> Iterator[Frame]:

@@ -3,6 +3,7 @@ import threading
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import cv2
@@ -12,6 +13,7 @@ import pytest
 from calibration.camera import OrthographicCamera
 from calibration.rig import Rig
 from groundwork import InputError
+from tracking.decoding import _Decoded, _Order
 from tracking.recordings import find_recordings
 from tracking.video import open_video
 
@@ -171,6 +173,20 @@ def test_frames_that_refer_to_a_damaged_one_are_missing_though_shown_before_it(t
                 wrong += np.abs(frame.picture.astype(float) - picture).max() > 8.0
     assert 30 <= lost < 300
     assert wrong == 0
+
+
+def test_a_stamp_far_ahead_does_not_keep_the_others_waiting() -> None:
+    """One packet of a hundred is stamped with nonsense; the others come one by one all the same."""
+    order, given = _Order(0.01), []
+    for number in range(100):
+        stamp = 10**9 if number == 20 else number
+        order.expect(SimpleNamespace(pts=stamp, size=10, is_keyframe=number == 0))
+        if number != 20:
+            given += order.shown(_Decoded(stamp, ramp(number % 12), None))
+        assert len(order.held) <= 33
+    given += order.rest()
+    assert [round(100 * frame.time) for frame in given] == [*range(20), *range(21, 100), 10**9]
+    assert all(frame.picture is not None for frame in given[:-1])
 
 
 def test_dropped_frames_and_uneven_times_are_honoured(tmp_path: Path) -> None:
