@@ -4,6 +4,7 @@ import heapq
 import logging
 from collections import deque
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -30,6 +31,7 @@ ASKED = 7
 # Decoders that refuse what is damaged, and need not be heard: this one writes dozens of lines a frame into its log, for
 # each of which PyAV waits for Python's lock, though nobody is to see them.
 OPEN = {"mjpeg"}
+_heard: list[str] = []  # the decoders at work that must be heard; the log is one for the whole program
 DEEPEST = 32  # frames that may be shown before one that they refer to: H.264 and HEVC allow 16
 
 
@@ -50,9 +52,10 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
     shown: list[float] = []
     try:
         with av.open(str(path)) as container:
-            for frame in _frames(container, notes):
-                shown.append(frame.time)
-                yield frame
+            with _log_of(container.streams.video[0].codec_context.name):
+                for frame in _frames(container, notes):
+                    shown.append(frame.time)
+                    yield frame
     except (av.FFmpegError, OSError) as error:
         if not shown:
             raise InputError(
@@ -64,15 +67,28 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
     notes += _contradictions(path.name, frames, fps, np.array(shown))
 
 
+@contextmanager
+def _log_of(decoder: str) -> Iterator[None]:
+    """The log is on while a video is read, but for decoders that need not be heard where no other is at work."""
+    quiet = decoder in OPEN
+    if not quiet:
+        _heard.append(decoder)
+    av.logging.set_level(None if quiet and not _heard else av.logging.ERROR)
+    try:
+        yield
+    finally:
+        if not quiet:
+            _heard.remove(decoder)
+        av.logging.set_level(av.logging.ERROR)
+
+
 def _frames(container: "av.container.InputContainer", notes: list[str]) -> Iterator[Frame]:
     stream = container.streams.video[0]
     stream.thread_type = "NONE"
     stream.codec_context.thread_count = 1
     stream.codec_context.options = STRICT
     assert stream.time_base is not None
-    name = stream.codec_context.name
-    tells = name == "h264"
-    av.logging.set_level(None if name in OPEN else av.logging.ERROR)
+    tells = stream.codec_context.name == "h264"
     order = _Order(float(stream.time_base))
     number = 0
     shape: tuple[int, ...] | None = None

@@ -13,7 +13,7 @@ import pytest
 from calibration.camera import OrthographicCamera
 from calibration.rig import Rig
 from groundwork import InputError
-from tracking.decoding import _Decoded, _Order
+from tracking.decoding import _Decoded, _Order, frames_of_file
 from tracking.recordings import find_recordings
 from tracking.video import open_video
 
@@ -173,6 +173,23 @@ def test_frames_that_refer_to_a_damaged_one_are_missing_though_shown_before_it(t
                 wrong += np.abs(frame.picture.astype(float) - picture).max() > 8.0
     assert 30 <= lost < 300
     assert wrong == 0
+
+
+def test_the_log_is_on_wherever_it_is_needed(tmp_path: Path) -> None:
+    """Off for MJPEG alone; a video read beside it whose decoder must be heard turns it on."""
+    write_video(tmp_path / "a.avi", "mjpeg", "yuvj420p")
+    write_video(tmp_path / "b.mkv", "ffv1", "gray")
+    quiet = frames_of_file(tmp_path / "a.avi", 0, 0.0, [])
+    next(quiet)
+    assert av.logging.get_level() is None
+    loud = frames_of_file(tmp_path / "b.mkv", 0, 0.0, [])
+    next(loud)
+    other = frames_of_file(tmp_path / "a.avi", 0, 0.0, [])
+    next(other)
+    assert av.logging.get_level() == av.logging.ERROR
+    for reading in (quiet, loud, other):
+        assert len(list(reading)) == FRAMES - 1
+        assert av.logging.get_level() == av.logging.ERROR
 
 
 def test_a_stamp_far_ahead_does_not_keep_the_others_waiting() -> None:
