@@ -128,20 +128,23 @@ def model_to_go_on_from(run: Path) -> FittedModel:
     return model
 
 
-def _corrected(dataset: Dataset, start: FittedModel, stepping: bool) -> Dataset:
-    """With what an earlier run identified, and, where wanted, stepping as that run did."""
+def _trained_on(datasets: list[Dataset], settings: Settings) -> tuple[FittedModel, list[Dataset]]:
+    """What training goes on from, and the datasets as it uses them: with what that run identified, stepping as it did
+    unless an integrator is asked for."""
+    start = model_to_go_on_from(Path(settings.start)) if settings.start else FittedModel("rafl")
     values: dict[str, Any] = dict(start.material or {})
-    simulator = start.simulator(dataset.simulator) if stepping else dataset.simulator
-    return replace(dataset, simulator=replace(simulator, material=replace(simulator.material, **values)))
+    used = []
+    for dataset in prepared(datasets, settings):
+        simulator = dataset.simulator if settings.integrator else start.simulator(dataset.simulator)
+        used.append(replace(dataset, simulator=replace(simulator, material=replace(simulator.material, **values))))
+    return start, used
 
 
 def nothing_to_follow(datasets: list[Dataset], settings: Settings) -> bool:
     """Whether a warm start is wanted that no dataset's simulator, as it will be trained with, can give."""
-    start = model_to_go_on_from(Path(settings.start)) if settings.start else FittedModel("rafl")
-    if settings.warm_start == 0 or start.field is not None:
-        return False
-    used = (_corrected(dataset, start, stepping=not settings.integrator) for dataset in prepared(datasets, settings))
-    return not any(can_be_followed(dataset.simulator) for dataset in used)
+    start, used = _trained_on(datasets, settings)
+    wanted = settings.warm_start > 0 and start.field is None
+    return wanted and not any(can_be_followed(dataset.simulator) for dataset in used)
 
 
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
@@ -165,7 +168,7 @@ def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, r
         SimulationError: every rollout of an epoch failed; names recording and step.
     """
     with processes() as group:
-        return _Training(prepared(datasets, settings), settings, run, report, group).go()
+        return _Training(datasets, settings, run, report, group).go()
 
 
 class _Training:
@@ -176,8 +179,7 @@ class _Training:
     ) -> None:
         self.settings, self.run, self.group = settings, run, group
         self.report: Report = report if group.first else lambda row: None
-        start = model_to_go_on_from(Path(settings.start)) if settings.start else FittedModel("rafl")
-        datasets = [_corrected(dataset, start, stepping=not settings.integrator) for dataset in datasets]
+        start, datasets = _trained_on(datasets, settings)
         self.items, self.validate = training_items(datasets), validation_batches(datasets)
         self.history: list[dict[str, float]] = []
         torch.manual_seed(settings.seed)

@@ -140,15 +140,16 @@ class _Order:
     """Puts frames into the order in which they are shown, each in its slot.
 
     Every packet has a slot by its time stamp. A frame that comes out of the decoder fills its own; slots before it
-    that are still empty were lost. A damaged frame spoils those of its group that were decoded after it. Some decoders
-    own up to damage only when the frame comes out, and frames that refer to it may be shown before it: none is given
-    on before all that were decoded before it are out.
+    that are still empty were lost, and what comes for them later is dropped. A damaged frame spoils those of its group
+    that were decoded after it. Some decoders own up to damage only when the frame comes out, and frames that refer to
+    it may be shown before it: none is given on before all that were decoded before it are out.
     """
 
     base: float
     packets: dict[int, _Packet] = field(default_factory=dict)
     waiting: list[int] = field(default_factory=list)
     held: deque[_Decoded] = field(default_factory=deque)
+    gone: set[int] = field(default_factory=set)  # stamps of lost slots
     broken: dict[int, int] = field(default_factory=dict)  # by group, the first damaged packet
     count: int = 0
     group: int = 0
@@ -177,7 +178,8 @@ class _Order:
 
     def shown(self, frame: _Decoded) -> Iterator[Frame]:
         """The frames that can be given on once this one is out."""
-        self.held.append(frame)
+        if frame.stamp not in self.gone:
+            self.held.append(frame)
         while self.held and (len(self.held) > DEEPEST or self._is_ready(self.held[0], frame.stamp)):
             yield from self._given_on(self.held.popleft())
 
@@ -212,6 +214,7 @@ class _Order:
         while self.waiting and (stamp is None or self.waiting[0] < stamp):
             lost = heapq.heappop(self.waiting)
             self.packets.pop(lost, None)
+            self.gone.add(lost)
             yield Frame(self._time(lost), None)
         if self.waiting and self.waiting[0] == stamp:
             heapq.heappop(self.waiting)

@@ -26,7 +26,7 @@ from capture.specimen import read_specimen
 from groundwork import write_text
 from rafl.dataset import Dataset
 from rafl.dataset_file import read_dataset, write_dataset
-from rafl.evaluation import compare, split_table
+from rafl.evaluation import compare_those_that_simulate, split_table
 from rafl.fit import Item, batches, mean_error
 from rafl.material import Material
 from rafl.mesh import HexMesh
@@ -119,7 +119,11 @@ class Study:
         """Rows of the table, from their file where they stand there."""
         path = self.out / "errors" / f"{shape}-{'-'.join(models)}.csv"
         if not path.exists():
-            table = split_table(compare(self.dataset(shape, "test"), models))
+            compared, failures = compare_those_that_simulate(self.dataset(shape, "test"), models)
+            for name, error in failures.items():
+                print(f"{self.name}: {name} fails on {shape}: {error}", flush=True)
+            failed = [{"method": name, "mean_mm": np.inf, "std_mm": np.nan} for name in failures]
+            table = pd.concat([split_table(compared), pd.DataFrame(failed)])
             write_text(path, table.to_csv(index=False))
         table = pd.read_csv(path)
         rows = []

@@ -206,6 +206,19 @@ def test_a_stamp_far_ahead_does_not_keep_the_others_waiting() -> None:
     assert all(frame.picture is not None for frame in given[:-1])
 
 
+def test_a_frame_that_comes_after_its_slot_was_given_up_is_dropped() -> None:
+    """As a damaged packet's does, long after frames that are shown later: every slot is given on once."""
+    order, given = _Order(0.01), []
+    for number in range(6):
+        order.expect(SimpleNamespace(pts=number, size=10, is_keyframe=True))
+        if number != 2:
+            given += order.shown(_Decoded(number, ramp(number), None))
+    given += order.shown(_Decoded(2, ramp(2), None))
+    given += order.rest()
+    assert [round(100 * frame.time) for frame in given] == list(range(6))
+    assert [frame.picture is None for frame in given] == [number == 2 for number in range(6)]
+
+
 def test_dropped_frames_and_uneven_times_are_honoured(tmp_path: Path) -> None:
     path = tmp_path / "a.mkv"
     stamps = [0, 10, 20, 50, 60, 71, 80]
