@@ -197,7 +197,8 @@ class _Training:
 
     def _teach(self, datasets: list[Dataset]) -> None:
         """A new field's scale and first lesson."""
-        self.field.scale_to([_sample_features(dataset) for dataset in datasets if dataset.split("train")])
+        samples = torch.cat([_sample_features(dataset) for dataset in datasets if dataset.split("train")])
+        self.field.scale_to(samples.square().mean(0).sqrt())
         warm_start(
             self.field, datasets, self.run, self.settings.warm_start, self.settings.seed,
             lambda: 1e3 * mean_error(self.validate, self.model), self.report,
@@ -311,11 +312,11 @@ class _Training:
 
 
 def _sample_features(dataset: Dataset) -> torch.Tensor:
-    """Features along the untouched simulator's motion, every tenth step."""
+    """Features along the untouched simulator's motion, every tenth step from the last."""
     simulator, names = dataset.simulator, dataset.split("train")
     steps = max(len(dataset.trajectories[name].time) for name in names) - 1
     with torch.no_grad():
         q, _ = rollout(simulator, dataset.start(names), steps)
     v = torch.diff(q, dim=0, prepend=q[:1]) / simulator.time_step
-    states = (np.ascontiguousarray(x[::10].flatten(0, 1).numpy()) for x in (q, v))
+    states = (np.ascontiguousarray(x.flip(0)[::10].flatten(0, 1).numpy()) for x in (q, v))
     return torch.from_numpy(FieldPoints.of(simulator).features(*states)[0]).T

@@ -1,7 +1,6 @@
 """The residual acceleration field: a small network on local features (paper, RAFL section)."""
 
 import itertools
-from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -10,6 +9,10 @@ from rafl.features import FEATURES, GaussPoints, features
 from rafl.field_force import FieldForce, FieldPoints
 from rafl.rollout import ResidualForce
 from rafl.simulator import Simulator
+
+KINDS = (slice(0, 13), slice(13, 31), slice(31, 34))  # strains, rates, accelerations by external forces
+SMALLEST = 1e-3  # size of a feature that counts, of its kind's
+NOTHING = 1e-6  # [1, 1/s, m/s^2]; a kind below it was not seen
 
 
 class ResidualField(nn.Module):
@@ -62,8 +65,15 @@ class ResidualField(nn.Module):
 
         return force
 
-    def scale_to(self, samples: Sequence[Tensor]) -> None:
-        """Set `scale` to one over each feature's root mean square over samples (..., 34)."""
-        stacked = torch.cat([sample.reshape(-1, FEATURES) for sample in samples])
-        size = stacked.square().mean(0).sqrt()
-        self.scale.copy_(1.0 / size.clamp_min(1e-3 * size.max()))
+    def scale_to(self, size: Tensor) -> None:
+        """Set `scale` from each feature's root mean square over some states, (34).
+
+        A feature is divided by the geometric mean of its own size and of its kind's. By its own alone, components that
+        the recordings hardly excite, as shear across a beam that bends in its plane, become the loudest on other
+        shapes; by its kind's alone, beams of another thickness come out worse.
+        """
+        self.scale.fill_(1.0)
+        for kind in KINDS:
+            together = size[kind].square().mean().sqrt()
+            if together > NOTHING:
+                self.scale[kind] = (size[kind].clamp_min(SMALLEST * together) * together).rsqrt()

@@ -154,3 +154,20 @@ def test_a_uniform_acceleration_weighs_the_body(mesh: HexMesh) -> None:
     acceleration = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).expand(1, len(mesh.hexes), 8, 3)
     force = points.accumulate(acceleration, len(mesh.vertices))
     np.testing.assert_allclose(force[0].sum(0).numpy(), 0.016 * np.array([1.0, 2.0, 3.0]))
+
+
+def test_scaled_features_have_no_units_and_no_giants(random: np.random.Generator) -> None:
+    """Rates in other units are the same inputs, and a feature that training hardly excites is not the loudest."""
+    model, size = ResidualField(), torch.tensor(random.uniform(0.5, 2.0, 34))
+    size[[5, 20]] = torch.tensor([1e-9, 0.0], dtype=torch.float64)
+    model.scale_to(size)
+    inputs = model.scale * size
+    other = size.clone()
+    other[13:31] *= 1000.0
+    model.scale_to(other)
+    assert torch.allclose(model.scale * other, inputs)
+    assert model.scale[:13].max() < 50.0 * model.scale[:13].min()
+    without_gravity = size.clone()
+    without_gravity[31:] = 0.0
+    model.scale_to(without_gravity)
+    assert torch.isfinite(model.scale).all()
