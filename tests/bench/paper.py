@@ -27,14 +27,16 @@ from groundwork import write_text
 from rafl.dataset import Dataset
 from rafl.dataset_file import read_dataset, write_dataset
 from rafl.evaluation import compare_those_that_simulate, split_table
-from rafl.fit import Item, batches, mean_error
+from rafl.fit import Item, batches, mean_error, shortened
 from rafl.material import Material
 from rafl.mesh import HexMesh
 from rafl.methods import METHODS
+from rafl.objective import Recordings
 from rafl.residual import ResidualField
 from rafl.run import FittedModel, Settings, load_model, load_tensors, write_settings
 from rafl.simulator import Simulator
 from rafl.synthetic import hung, released, twisted, with_material
+from rafl.targets import PENALTY, residual_targets
 
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
 SPECIMENS = EXPERIMENTS.parent / "specimens"
@@ -90,6 +92,24 @@ class Study:
             write_dataset(path, released(shape, base, target, starts, self.plan["frames"], names, self.name))
         return read_dataset(path)
 
+    def softened(self, shape: str) -> Dataset:
+        """The test recordings as the untouched simulator follows them by the least forces (paper, eq. 4).
+
+        The paper scores the shape trained on against these (its original simulator is off by 4.369 mm there, and by
+        4.393 mm from the target itself). The last frame is left out: the forces that lead to it end in no state.
+        """
+        path = self.out / "datasets" / f"{shape}-softened-test.h5"
+        if not path.exists():
+            print(f"{self.name}: following {shape}", flush=True)
+            dataset = self.dataset(shape, "test")
+            names = list(dataset.trajectories)
+            followed = residual_targets(Recordings.of(dataset, names), PENALTY)
+            markers = dataset.markers.positions(torch.from_numpy(followed.q)).numpy()
+            short = shortened(dataset, len(markers))
+            items = {name: replace(short.trajectories[name], markers=markers[:, b]) for b, name in enumerate(names)}
+            write_dataset(path, replace(short, name=f"{shape}-softened", trajectories=items))
+        return read_dataset(path)
+
     def few(self, shape: str) -> Dataset:
         """Two training recordings and one to validate by."""
         dataset = self.dataset(shape, "train", "val")
@@ -115,13 +135,15 @@ class Study:
             write_text(folder / "seconds", f"{time.perf_counter() - begun:.1f}\n")
         return load_model(folder)
 
-    def errors(self, shape: str, models: dict[str, FittedModel]) -> list[dict[str, Any]]:
+    def errors(self, shape: str, models: dict[str, FittedModel], softened: bool = False) -> list[dict[str, Any]]:
         """Rows of the table, from their file where they stand there."""
-        path = self.out / "errors" / f"{shape}-{'-'.join(models)}.csv"
+        label = f"{shape}-softened" if softened else shape
+        path = self.out / "errors" / f"{label}-{'-'.join(models)}.csv"
         if not path.exists():
-            compared, failures = compare_those_that_simulate(self.dataset(shape, "test"), models)
+            dataset = self.softened(shape) if softened else self.dataset(shape, "test")
+            compared, failures = compare_those_that_simulate(dataset, models)
             for name, error in failures.items():
-                print(f"{self.name}: {name} fails on {shape}: {error}", flush=True)
+                print(f"{self.name}: {name} fails on {label}: {error}", flush=True)
             failed = [{"method": name, "mean_mm": np.inf, "std_mm": np.nan} for name in failures]
             table = pd.concat([split_table(compared), pd.DataFrame(failed)])
             write_text(path, table.to_csv(index=False))
@@ -130,7 +152,7 @@ class Study:
         for row in table.to_dict("records"):
             mean, std = self.plan["paper"][shape].get(row["method"], (np.nan, np.nan))
             rows.append(
-                dict(zip(COLUMNS, (shape, row["method"], row["mean_mm"], row["std_mm"], mean, std), strict=True))
+                dict(zip(COLUMNS, (label, row["method"], row["mean_mm"], row["std_mm"], mean, std), strict=True))
             )
         return rows
 
@@ -146,6 +168,7 @@ class Study:
         for shape, mesh in self.meshes.items():
             same = len(mesh.vertices) == len(self.meshes[trained].vertices)
             rows += self.errors(shape, {"rafl": rafl, "srl": srl} if same else {"rafl": rafl})
+        rows += self.errors(trained, {"rafl": rafl, "srl": srl}, softened=True)
         return pd.DataFrame(rows, columns=COLUMNS)
 
     def fine_tuning(self) -> pd.DataFrame:
@@ -183,6 +206,7 @@ class Study:
 def time_to_accuracy(study: Study) -> None:
     """Seconds of training until the canonical test error falls below some marks; what measures it does not count."""
     dataset, test = study.dataset("canonical", "train", "val"), study.dataset("canonical", "test")
+    softened = study.softened("canonical")
     run = study.out / "runs" / "clock"
     shutil.rmtree(run, ignore_errors=True)
     run.mkdir(parents=True)
@@ -197,8 +221,10 @@ def time_to_accuracy(study: Study) -> None:
         if "epoch" in row:
             field = ResidualField()
             field.load_state_dict(load_tensors(run / "checkpoint.pt", "a checkpoint")["field"])
-            held_out = batches([Item(test, name) for name in test.split("test")])
-            error = f", test {1e3 * mean_error(held_out, FittedModel('rafl', field=field)):.3f} mm"
+            model = FittedModel("rafl", field=field)
+            for what, held_out in {"test": test, "softened as the paper's": softened}.items():
+                recordings = batches([Item(held_out, name) for name in held_out.split("test")])
+                error += f", {what} {1e3 * mean_error(recordings, model):.3f} mm"
         words = ", ".join(f"{key} {value:.4g}" for key, value in row.items() if key in ("warm_start", "epoch"))
         print(f"{words}: after {now - begun - measuring:.1f} s (this one {step:.1f} s){error}", flush=True)
         last = time.perf_counter()
