@@ -38,21 +38,21 @@ def check_inputs(method: str, datasets: list[Dataset], start: Path | None, integ
         raise InputError(f"--method: expected {', '.join(METHODS)}, found {method!r}")
     if integrator and integrator not in INTEGRATORS:
         raise InputError(f"--integrator: expected {' or '.join(INTEGRATORS)}, found {integrator!r}")
-    _one_stepping(datasets, integrator)
+    if start is not None and method != "rafl":
+        raise InputError(f"--from: expected method rafl, found {method}; leave it out")
+    before = FittedModel(method) if start is None else model_to_go_on_from(start)
+    _one_stepping(datasets, before, integrator)
     training_items(datasets)
     if method == "srl":
         one_mesh(datasets)
-    if start is not None:
-        if method != "rafl":
-            raise InputError(f"--from: expected method rafl, found {method}; leave it out")
-        model_to_go_on_from(start)
 
 
-def _one_stepping(datasets: list[Dataset], integrator: str) -> None:
-    """Refuses datasets whose simulators step differently: a model is of one way to step."""
-    ways = {
-        dataset.name: (integrator or dataset.simulator.integrator, dataset.simulator.substeps) for dataset in datasets
-    }
+def _one_stepping(datasets: list[Dataset], before: FittedModel, integrator: str) -> None:
+    """Refuses datasets whose simulators would step differently: a model is of one way to step."""
+    ways = {}
+    for dataset in datasets:
+        simulator = dataset.simulator if integrator else before.simulator(dataset.simulator)
+        ways[dataset.name] = (integrator or simulator.integrator, simulator.substeps)
     if len(set(ways.values())) > 1:
         found = ", ".join(f"{name}: {way}, {substeps} substeps" for name, (way, substeps) in ways.items())
         raise InputError(

@@ -13,6 +13,7 @@ from rafl.errors import SimulationError
 from rafl.evaluation import compare
 from rafl.fit import fit_residual_field, mean_error, nothing_to_follow, training_items, validation_batches
 from rafl.mesh import HexMesh
+from rafl.methods import check_inputs
 from rafl.objective import Recordings
 from rafl.run import FittedModel, Settings, load_model
 from rafl.supervised import fit_supervised
@@ -104,6 +105,11 @@ def test_a_model_steps_as_it_was_fitted(dataset: Dataset, tmp_path: Path) -> Non
     assert corrected.stepping == identified.stepping
     assert nothing_to_follow([dataset], replace(settings, warm_start=3))
     assert not nothing_to_follow([dataset], replace(settings, warm_start=3, start=""))
+    other_steps = replace(dataset, name="other", simulator=replace(dataset.simulator, substeps=2))
+    check_inputs("rafl", [dataset, other_steps], tmp_path / "a", "")
+    for start, integrator in ((None, ""), (tmp_path / "a", "generalised-alpha")):
+        with pytest.raises(InputError, match="2 substeps"):
+            check_inputs("rafl", [dataset, other_steps], start, integrator)
     untrained = 1e3 * mean_error(validation_batches([dataset]), identified)
     assert rows[0]["validation_mm"] == pytest.approx(untrained, rel=0.05)  # the new field is nearly none
 
