@@ -19,8 +19,9 @@ MODELS: dict[str, list[object]] = {  # rafl-fit's options
     "sysid-e": ["--method", "sysid-e", "--epochs", 15],
     "rafl": ["--epochs", 25],
     "sysid-damping": ["--method", "sysid-damping", "--epochs", 25, "--integrator", "generalised-alpha"],
-    "rafl-from-sysid": ["--epochs", 25, "--from"],
+    "rafl-from-sysid": ["--epochs", 25],
 }
+STARTS = {"rafl-from-sysid": "sysid-damping"}  # whose run it goes on from
 COLUMNS = ["original", "original (paper preset)", *MODELS]
 
 
@@ -46,7 +47,7 @@ def hold_out(recording: str, table: pd.DataFrame, recordings: Path, out: Path) -
             if run.exists() and not going_on:
                 for path in run.iterdir():
                     path.unlink()
-            start = [out / "sysid-damping"] if "--from" in options else []
+            start = ["--from", out / STARTS[name]] if name in STARTS else []
             command("rafl-fit", dataset, "--out", run, "--by-sigma", *options, *start, *going_on)
             (run / "finished").touch()
     if not (out / "errors.csv").exists():
