@@ -96,7 +96,8 @@ class Study:
         """The test recordings as the untouched simulator follows them by the least forces (paper, eq. 4).
 
         The paper scores the shape trained on against these (its original simulator is off by 4.369 mm there, and by
-        4.393 mm from the target itself). The last frame is left out: the forces that lead to it end in no state.
+        4.393 mm from the target itself). The last frame is left out: targets hold the states that steps start
+        from.
         """
         path = self.out / "datasets" / f"{shape}-softened-test.h5"
         if not path.exists():
