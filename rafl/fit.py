@@ -196,8 +196,11 @@ class _Training:
         self.shuffle = torch.Generator().manual_seed(settings.seed)
 
     def _teach(self, datasets: list[Dataset]) -> None:
-        """A new field's scale and first lesson."""
-        samples = torch.cat([_sample_features(dataset) for dataset in datasets if dataset.split("train")])
+        """A new field's symmetry, scale and first lesson."""
+        taught = [dataset for dataset in datasets if dataset.split("train")]
+        mirrors = np.logical_and.reduce([dataset.simulator.mirrors for dataset in taught])
+        self.field.mirror(torch.from_numpy(mirrors))
+        samples = torch.cat([_sample_features(dataset) for dataset in taught])
         self.field.scale_to(samples.square().mean(0).sqrt())
         warm_start(
             self.field, datasets, self.run, self.settings.warm_start, self.settings.seed,
@@ -287,7 +290,7 @@ class _Training:
 
     def _resume(self) -> None:
         saved = load_tensors(self.run / CHECKPOINT, "a checkpoint of this run")
-        self.field.load_state_dict(saved["field"])
+        self.field.restore(saved["field"])
         self.optimiser.load_state_dict(saved["optimiser"])
         self.schedule.load_state_dict(saved["schedule"])
         self.shuffle.set_state(saved["shuffle"])

@@ -5,6 +5,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
 CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=float)
 
@@ -132,6 +133,23 @@ class HexMesh:
         length = np.linalg.norm(self.vertices[first] - self.vertices[second], axis=1)
         change = displacement[:, first] - displacement[:, second]
         return np.sqrt(((change**2).sum(-1) / length**2).max(axis=1))
+
+    def mirrors(self, held: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether the plane across each axis (3), through the middle, maps the cells and the vertices `held` onto
+        themselves."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        tree, own = cKDTree(self.vertices), np.unique(np.sort(self.hexes, axis=1), axis=0)
+        mapped = np.zeros(3, dtype=bool)
+        for axis in range(3):
+            places = self.vertices.copy()
+            places[:, axis] = low[axis] + high[axis] - places[:, axis]
+            distance, image = tree.query(places)
+            mapped[axis] = (
+                distance.max() < 1e-6 * (high - low).max()
+                and np.array_equal(np.unique(np.sort(image[self.hexes], axis=1), axis=0), own)
+                and np.array_equal(np.unique(image[held]), np.unique(held))
+            )
+        return mapped
 
     @cached_property
     def surface(self) -> NDArray[np.int64]:

@@ -175,7 +175,7 @@ def load_model(run: Path) -> FittedModel:
         network.load_state_dict(content["network"])
     if "field" in content:
         field = ResidualField()
-        field.load_state_dict(content["field"])
+        field.restore(content["field"])
     return FittedModel(content["method"], field, material, network, stepping)
 
 

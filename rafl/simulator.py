@@ -23,6 +23,7 @@ Array = NDArray[Any]
 
 GRAVITY = (0.0, 0.0, -9.80709)
 ARITHMETIC = ("compiled", "plain")
+UPRIGHT = 0.02  # of gravity: what its component across a plane of symmetry may be
 
 
 @dataclass(frozen=True)
@@ -86,6 +87,12 @@ class Simulator:
     def node_mass(self) -> Array:
         """Nodal masses [kg], (N,)."""
         return self.material.density * self.node_volume
+
+    @property
+    def mirrors(self) -> NDArray[np.bool_]:
+        """Whether the specimen, as it is held and as gravity pulls, is its own mirror image across each axis, (3)."""
+        across = np.abs(self.gravity) <= UPRIGHT * np.linalg.norm(self.gravity)
+        return self.mesh.mirrors(self.fixed) & across
 
     @property
     def weight(self) -> Array:

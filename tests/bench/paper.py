@@ -1,10 +1,10 @@
 """The paper's sim-to-sim studies from nothing: its shapes, methods and fine-tuning, its numbers beside ours.
 
     python tests/bench/paper.py [vibration] [twist] [--quick] [--out build/paper] [--results datasets/results]
-                                [--tail-cells CELLS.npy]
+                                [--tail-cells CELLS.npy] [--seed 0]
 
-Each study is a file in datasets/experiments. Resumable: what stands under --out is not computed again. --quick leaves
-out the fine fish-tail and trains less.
+Each study is a file in datasets/experiments. Resumable: what stands under --out is not computed again, for each seed of
+its own. --quick leaves out the fine fish-tail and trains less.
 """
 
 import argparse
@@ -40,7 +40,6 @@ from rafl.targets import PENALTY, residual_targets
 
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
 SPECIMENS = EXPERIMENTS.parent / "specimens"
-SEED = 0
 LARGE = 1000  # vertices: such a shape is fine-tuned for fewer epochs, and left out by --quick
 BEAMS = ("canonical", "longer", "shorter", "thicker", "thinner")
 COLUMNS = ["shape", "method", "mean_mm", "std_mm", "paper_mean_mm", "paper_std_mm"]
@@ -63,8 +62,9 @@ FULL, QUICK = Effort(60, 1000, 40, 30, 4), Effort(20, 150, 8, 5, None)
 class Study:
     """One experiment under one folder."""
 
-    def __init__(self, name: str, out: Path, effort: Effort, tail: Path | None) -> None:
-        self.name, self.out, self.effort = name, out / name, effort
+    def __init__(self, name: str, out: Path, effort: Effort, seed: int, tail: Path | None) -> None:
+        self.name, self.out, self.effort, self.seed = name, out / name, effort, seed
+        self.runs, self.tables = (self.out / f"{what}-{seed}" for what in ("runs", "errors"))
         self.plan = yaml.safe_load((EXPERIMENTS / f"{name}.yaml").read_text())
         self.meshes = {shape: read_specimen(SPECIMENS / f"{shape}.yaml").mesh for shape in self.plan["paper"]}
         if tail is not None:
@@ -119,11 +119,11 @@ class Study:
 
     def fit(self, run: str, method: str, datasets: list[Dataset], **changes: Any) -> FittedModel:
         """A model, fitted where it is not yet; how long that took stands in its folder."""
-        folder = self.out / "runs" / run
+        folder = self.runs / run
         if not (folder / "seconds").exists():
-            epochs = changes.pop("epochs")
+            epochs, rate = changes.pop("epochs"), changes.pop("rate", 2e-3)
             settings = Settings(
-                method, tuple(item.name for item in datasets), epochs, 2e-3, 1e-5, epochs, 0, SEED, **changes
+                method, tuple(item.name for item in datasets), epochs, rate, 1e-5, epochs, 0, self.seed, **changes
             )
             write_settings(folder, settings)
             begun = time.perf_counter()
@@ -139,7 +139,7 @@ class Study:
     def errors(self, shape: str, models: dict[str, FittedModel], softened: bool = False) -> list[dict[str, Any]]:
         """Rows of the table, from their file where they stand there."""
         label = f"{shape}-softened" if softened else shape
-        path = self.out / "errors" / f"{label}-{'-'.join(models)}.csv"
+        path = self.tables / f"{label}-{'-'.join(models)}.csv"
         if not path.exists():
             dataset = self.softened(shape) if softened else self.dataset(shape, "test")
             compared, failures = compare_those_that_simulate(dataset, models)
@@ -163,7 +163,8 @@ class Study:
         own = [self.dataset(trained, "train", "val")]
         training = self.plan["training"]
         epochs = min(training["epochs"], self.effort.rafl)
-        rafl = self.fit("rafl", "rafl", own, epochs=epochs, force_penalty=1e-6, warm_start=training["warm_start"])
+        how = {"rate": training["learning_rate"], "warm_start": training["warm_start"], "force_penalty": 1e-6}
+        rafl = self.fit("rafl", "rafl", own, epochs=epochs, **how)
         srl = self.fit("srl", "srl", own, epochs=self.effort.srl)
         rows: list[dict[str, Any]] = []
         for shape, mesh in self.meshes.items():
@@ -174,7 +175,7 @@ class Study:
 
     def fine_tuning(self) -> pd.DataFrame:
         """Fish-tails before and after going on with their own recordings."""
-        start = str((self.out / "runs" / "rafl").resolve())
+        start = str((self.runs / "rafl").resolve())
         rows: list[dict[str, Any]] = []
         for shape in self.plan["fine_tuned"]:
             if shape not in self.meshes:
@@ -200,7 +201,7 @@ class Study:
 
     def seconds(self) -> str:
         """What each fit took."""
-        files = sorted((self.out / "runs").glob("*/seconds"))
+        files = sorted(self.runs.glob("*/seconds"))
         return ", ".join(f"{file.parent.name} {float(file.read_text()):.0f} s" for file in files)
 
 
@@ -208,10 +209,10 @@ def time_to_accuracy(study: Study) -> None:
     """Seconds of training until the canonical test error falls below some marks; what measures it does not count."""
     dataset, test = study.dataset("canonical", "train", "val"), study.dataset("canonical", "test")
     softened = study.softened("canonical")
-    run = study.out / "runs" / "clock"
+    run = study.runs / "clock"
     shutil.rmtree(run, ignore_errors=True)
     run.mkdir(parents=True)
-    settings = Settings("rafl", ("canonical",), 20, 1e-3, 1e-5, 20, 0, SEED, force_penalty=1e-6, warm_start=20)
+    settings = Settings("rafl", ("canonical",), 20, 1e-3, 1e-5, 20, 0, study.seed, force_penalty=1e-6, warm_start=20)
     begun = last = time.perf_counter()
     measuring = 0.0
 
@@ -221,7 +222,7 @@ def time_to_accuracy(study: Study) -> None:
         step, error = now - last, ""
         if "epoch" in row:
             field = ResidualField()
-            field.load_state_dict(load_tensors(run / "checkpoint.pt", "a checkpoint")["field"])
+            field.restore(load_tensors(run / "checkpoint.pt", "a checkpoint")["field"])
             model = FittedModel("rafl", field=field)
             for what, held_out in {"test": test, "softened as the paper's": softened}.items():
                 recordings = batches([Item(held_out, name) for name in held_out.split("test")])
@@ -257,6 +258,7 @@ def main() -> None:
     parser.add_argument("--large-epochs", type=int, help="of fine-tuning the fine fish-tail; 0: none, -1: leave out")
     parser.add_argument("--out", type=Path, default=Path("build/paper"))
     parser.add_argument("--results", type=Path, help="folder for the tables")
+    parser.add_argument("--seed", type=int, default=0, help="of all training")
     parser.add_argument("--tail-cells", type=Path, help="cells of the paper's own fine fish-tail, a boolean array")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -266,15 +268,15 @@ def main() -> None:
     if (results / "fine-tuning.csv").exists():
         earlier = pd.read_csv(results / "fine-tuning.csv", comment="#")
         fine.append(earlier[~earlier["study"].isin(options.studies)])
-    machine = f"{platform.machine()}, 2 threads at most, torch {torch.__version__}, seed {SEED}"
+    machine = f"{platform.machine()}, 2 threads at most, torch {torch.__version__}, seed {options.seed}"
     if options.time_to_accuracy:
-        time_to_accuracy(Study("vibration", out, QUICK, None))
+        time_to_accuracy(Study("vibration", out, QUICK, options.seed, None))
         return
     for name in options.studies:
         effort = QUICK if options.quick else FULL
         if options.large_epochs is not None:
             effort = replace(effort, fine_large=options.large_epochs if options.large_epochs >= 0 else None)
-        study = Study(name, out, effort, options.tail_cells)
+        study = Study(name, out, effort, options.seed, options.tail_cells)
         table = study.table()
         show(name, table)
         write_table(results / f"{name}.csv", table, [machine, f"fits took {study.seconds()}"])

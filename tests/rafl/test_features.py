@@ -85,6 +85,34 @@ def test_force_turns_with_the_body(field: tuple[ResidualField, Simulator], rando
     torch.testing.assert_close(model.on(turned)(q @ turn.T, v @ turn.T, 0 * q), force @ turn.T, atol=1e-12, rtol=1e-9)
 
 
+@pytest.mark.parametrize("mirrors", [[False, True, False], [False, True, True], [True, True, True]])
+def test_mirrored_motion_meets_the_mirrored_force(
+    mesh: HexMesh, mirrors: list[bool], random: np.random.Generator
+) -> None:
+    """Across every axis that the field is mirrored in, gravity included; not across the others."""
+    torch.manual_seed(3)
+    model = ResidualField()
+    model.mirror(torch.tensor(mirrors))
+    q = mesh.vertices + random.normal(0, 1e-3, mesh.vertices.shape)
+    v = random.normal(0, 0.2, q.shape)
+    gravity = np.array([1.0, 3.0, -9.0])
+
+    def force(q: np.ndarray, v: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        simulator = Simulator(mesh, Material(), mesh.face_nodes("x-min"), gravity=tuple(gravity.tolist()))
+        with torch.no_grad():
+            states = (torch.tensor(x[None]) for x in (q, v, 0.0 * v))
+            return model.on(simulator)(*states)[0].numpy()
+
+    for axis, mirrored in enumerate(mirrors):
+        sign = 1.0 - 2.0 * np.eye(3)[axis]
+        width = np.ptp(mesh.vertices[:, axis])
+        there = (mesh.vertices - width * np.eye(3)[axis]) * sign
+        image = np.linalg.norm(mesh.vertices[:, None] - there[None], axis=-1).argmin(axis=1)
+        found = force((q[image] * sign) + width * np.eye(3)[axis], v[image] * sign, gravity * sign)
+        expected = force(q, v, gravity)[image] * sign
+        assert np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max()) == mirrored
+
+
 def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
     model, simulator = field
     q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
@@ -102,12 +130,14 @@ def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], ran
     assert float((q.grad * dq + v.grad * dv).sum()) == pytest.approx(float(slope), rel=1e-5)
 
 
+@pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("still", [True, False])
-def test_compiled_field_is_the_plain_one(still: bool, random: np.random.Generator) -> None:
+def test_compiled_field_is_the_plain_one(still: bool, mirrored: bool, random: np.random.Generator) -> None:
     """Forces and every derivative of several bent states, at rest too, on cells of different shapes."""
     torch.manual_seed(1)
     model = ResidualField()
     model.scale.copy_(torch.linspace(0.5, 20.0, 34))
+    model.mirror(torch.tensor([False, mirrored, mirrored]))
     cells = np.ones((3, 2, 2), dtype=bool)
     cells[2, 1] = False
     mesh = HexMesh.from_grid(cells, (0.01, 0.012, 0.008))

@@ -87,6 +87,20 @@ def test_a_whole_grid_is_the_box() -> None:
     np.testing.assert_array_equal(grid.hexes, box.hexes)
 
 
+def test_planes_of_symmetry() -> None:
+    mesh = HexMesh.box((3, 2, 2), (0.03, 0.02, 0.01))
+    nothing = np.array([], dtype=np.int64)
+    assert mesh.mirrors(nothing).tolist() == [True, True, True]
+    assert mesh.mirrors(mesh.face_nodes("x-min")).tolist() == [False, True, True]
+    assert mesh.mirrors(mesh.face_nodes("x-min")[:2]).tolist() == [False, False, False]
+    cells = np.ones((3, 2, 2), dtype=bool)
+    cells[2, :, 1] = False
+    notched = HexMesh.from_grid(cells, 0.01)
+    assert notched.mirrors(nothing).tolist() == [False, True, False]
+    bent = notched.vertices + 1e-4 * notched.vertices[:, [1]]
+    assert HexMesh(bent, notched.hexes).mirrors(nothing).tolist() == [False, False, False]
+
+
 @pytest.mark.parametrize("damage", ["inverted", "flat"])
 def test_bad_cells_are_refused_by_index(damage: str) -> None:
     mesh = HexMesh.box((3, 1, 1), (0.03, 0.01, 0.01))
