@@ -40,7 +40,8 @@ from rafl.targets import PENALTY, residual_targets
 
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
 SPECIMENS = EXPERIMENTS.parent / "specimens"
-LARGE = 1000  # vertices: such a shape is fine-tuned for fewer epochs, and left out by --quick
+LARGE = 1000  # vertices: such a shape is fine-tuned for fewer epochs of fewer frames, and left out by --quick
+LARGE_FRAMES = 50
 BEAMS = ("canonical", "longer", "shorter", "thicker", "thinner")
 COLUMNS = ["shape", "method", "mean_mm", "std_mm", "paper_mean_mm", "paper_std_mm"]
 
@@ -121,10 +122,8 @@ class Study:
         """A model, fitted where it is not yet; how long that took stands in its folder."""
         folder = self.runs / run
         if not (folder / "seconds").exists():
-            epochs, rate = changes.pop("epochs"), changes.pop("rate", 2e-3)
-            settings = Settings(
-                method, tuple(item.name for item in datasets), epochs, rate, 1e-5, epochs, 0, self.seed, **changes
-            )
+            first = Settings(method, tuple(item.name for item in datasets), 0, 2e-3, 1e-5, 0, 0, self.seed)
+            settings = replace(first, **changes, patience=changes["epochs"])
             write_settings(folder, settings)
             begun = time.perf_counter()
 
@@ -163,7 +162,7 @@ class Study:
         own = [self.dataset(trained, "train", "val")]
         training = self.plan["training"]
         epochs = min(training["epochs"], self.effort.rafl)
-        how = {"rate": training["learning_rate"], "warm_start": training["warm_start"], "force_penalty": 1e-6}
+        how = {"learning_rate": training["learning_rate"], "warm_start": training["warm_start"], "force_penalty": 1e-6}
         rafl = self.fit("rafl", "rafl", own, epochs=epochs, **how)
         srl = self.fit("srl", "srl", own, epochs=self.effort.srl)
         rows: list[dict[str, Any]] = []
@@ -185,7 +184,8 @@ class Study:
             if not epochs:
                 continue
             own = [self.dataset(shape, "train", "val")]
-            tuned = self.fit(f"fine-{shape}", "rafl", own, epochs=epochs, start=start, force_penalty=0.0)
+            frames = LARGE_FRAMES if large else 0
+            tuned = self.fit(f"fine-{shape}", "rafl", own, epochs=epochs, start=start, frames=frames, force_penalty=0.0)
             found = self.errors(shape, {"rafl-fine-tuned": tuned})
             rows += [{**row, "shape": f"{shape}"} for row in found if row["method"] == "rafl-fine-tuned"]
         return pd.DataFrame(rows, columns=COLUMNS)
