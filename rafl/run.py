@@ -170,12 +170,16 @@ def load_model(run: Path) -> FittedModel:
             f"expected an integrator and substeps in {run / 'model.pt'}, found {stepping!r:.80}; fit again"
         )
     network = field = None
-    if "network" in content:
-        network = GlobalResidual(content["nodes"])
-        network.load_state_dict(content["network"])
-    if "field" in content:
-        field = ResidualField()
-        field.restore(content["field"])
+    try:
+        if "network" in content:
+            network = GlobalResidual(content["nodes"])
+            network.load_state_dict(content["network"])
+        if "field" in content:
+            field = ResidualField()
+            field.restore(content["field"])
+    except RuntimeError as error:  # other names or shapes of weights
+        reason = str(error).splitlines()[-1].strip()
+        raise InputError(f"expected weights of this version in {run / 'model.pt'}: {reason:.120}; fit again") from None
     return FittedModel(content["method"], field, material, network, stepping)
 
 

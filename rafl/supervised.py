@@ -9,7 +9,7 @@ from torch import Tensor
 from groundwork import InputError
 from rafl.dataset import Dataset
 from rafl.fit import Report, mean_error, prepared, training_items, validation_batches
-from rafl.global_residual import GlobalResidual
+from rafl.global_residual import GlobalResidual, motion_of
 from rafl.run import FittedModel, Settings, load_model, save_model, stale, write_history
 from rafl.targets import training_targets
 
@@ -88,6 +88,6 @@ def _lessons(datasets: list[Dataset], run: Path) -> tuple[Tensor, Tensor]:
     states, forces = [], []
     for number, dataset in enumerate(dataset for dataset in datasets if dataset.split("train")):
         q, v, force = training_targets(dataset, run / f"targets-{number}.pt")
-        states.append(torch.cat([q.flatten(1), v.flatten(1)], dim=1).float())
+        states.append(motion_of(q, v, torch.from_numpy(dataset.simulator.mesh.vertices)))
         forces.append(force.flatten(1).float())
     return torch.cat(states), torch.cat(forces)

@@ -12,10 +12,12 @@ from rafl.dataset import Dataset
 from rafl.errors import SimulationError
 from rafl.evaluation import compare
 from rafl.fit import fit_residual_field, mean_error, nothing_to_follow, training_items, validation_batches
+from rafl.global_residual import GlobalResidual
 from rafl.mesh import HexMesh
 from rafl.methods import check_inputs
 from rafl.objective import Recordings
-from rafl.run import FittedModel, Settings, load_model, load_tensors, save_tensors
+from rafl.residual import ResidualField
+from rafl.run import FittedModel, Settings, load_model, load_tensors, save_model, save_tensors
 from rafl.supervised import fit_supervised
 from rafl.sysid import _Search, identify_material, spoken
 from rafl.targets import residual_targets
@@ -245,9 +247,30 @@ def test_supervised_residuals(dataset: Dataset, tmp_path: Path) -> None:
     assert mean_error(train, model) < 0.3 * mean_error(train, FittedModel("original"))
     again = load_model(tmp_path)
     assert mean_error(train, again) == mean_error(train, model)
-    other = replace(dataset.simulator, mesh=HexMesh.box((2, 1, 1), (0.02, 0.01, 0.01)))
+    own = dataset.simulator
+    stretched = replace(own, mesh=own.mesh.scaled([1.2, 0.9, 1.0]))
+    forces = []
+    for simulator in (own, stretched):
+        residual, rest = model.residual(simulator), torch.from_numpy(simulator.mesh.vertices)[None]
+        assert residual is not None
+        forces.append(residual(rest, torch.zeros_like(rest), torch.zeros_like(rest)).detach())
+    assert torch.equal(*forces)
+    assert forces[0].abs().max() > 0
+    other = replace(own, mesh=HexMesh.box((2, 1, 1), (0.02, 0.01, 0.01)))
     with pytest.raises(InputError, match=r"srl: expected the mesh .* found 12"):
         model.residual(other)
+
+
+@pytest.mark.parametrize("method", ["rafl", "srl"])
+def test_weights_of_another_version_are_refused(method: str, dataset: Dataset, tmp_path: Path) -> None:
+    model = FittedModel("rafl", ResidualField()) if method == "rafl" else FittedModel("srl", network=GlobalResidual(8))
+    save_model(tmp_path, model)
+    content = load_tensors(tmp_path / "model.pt", "a model")
+    part = content["field" if method == "rafl" else "network"]
+    part["unknown"] = part.pop("scale" if method == "rafl" else "motion_mean")
+    save_tensors(tmp_path / "model.pt", content)
+    with pytest.raises(InputError, match=r"weights of this version in .*model\.pt.*fit again"):
+        load_model(tmp_path)
 
 
 def test_nothing_to_train_on_is_refused(dataset: Dataset) -> None:
