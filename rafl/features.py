@@ -126,3 +126,11 @@ def features(q: Tensor, v: Tensor, points: GaussPoints, gravity: Tensor) -> tupl
     ]
     shape = (batch, cells, 8)
     return torch.cat(parts, dim=-1).reshape(*shape, FEATURES), R.reshape(*shape, 3, 3)
+
+
+def mirrored_features(sign: Tensor) -> Tensor:
+    """The signs, (34), that the features take in a mirror where a vector's components take the signs `sign` (3)."""
+    one, even = sign.new_ones(1), sign.new_ones(3)
+    tensor = torch.outer(sign, sign).flatten()
+    axial = sign.prod() * sign
+    return torch.cat([even, tensor, one, even, one, tensor, one, axial, one, sign])

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rafl.features import FEATURES, GaussPoints, features
+from rafl.features import FEATURES, GaussPoints, features, mirrored_features
 from rafl.field_force import FieldForce, FieldPoints
 from rafl.rollout import ResidualForce
 from rafl.simulator import Simulator
@@ -17,14 +17,6 @@ SMALLEST = 1e-3  # size of a feature that counts, of its kind's
 NOTHING = 1e-6  # [1, 1/s, m/s^2]; a kind below it was not seen
 
 MIRROR = 1.0 - 2.0 * torch.eye(3, dtype=torch.float64)  # signs of a vector's components, a row for each axis
-
-
-def _mirrored(sign: Tensor) -> Tensor:
-    """Signs that the features take in a mirror with these signs of a vector (3); (34)."""
-    one, even = sign.new_ones(1), sign.new_ones(3)
-    tensor = torch.outer(sign, sign).flatten()
-    axial = sign.prod() * sign
-    return torch.cat([even, tensor, one, even, one, tensor, one, axial, one, sign])
 
 
 class ResidualField(nn.Module):
@@ -41,12 +33,17 @@ class ResidualField(nn.Module):
     Args:
         width: units of each hidden layer, a multiple of 8.
         layers: how many of them.
+
+    Raises:
+        ValueError: another width, whose units cannot change places in every mirror.
     """
 
     scale: Tensor
     mirrors: Tensor
 
     def __init__(self, width: int = 64, layers: int = 4) -> None:
+        if width % 8:
+            raise ValueError(f"expected a width that is a multiple of 8, got {width}")
         super().__init__()
         sizes = [FEATURES, *[width] * layers]
         stack: list[nn.Module] = []
@@ -81,7 +78,7 @@ class ResidualField(nn.Module):
         for axis in self.mirrors.nonzero()[:, 0].tolist():
             sign = MIRROR[axis]
             swap = torch.arange(len(first)) ^ (1 << axis)
-            first = 0.5 * (first + first[swap] * _mirrored(sign))
+            first = 0.5 * (first + first[swap] * mirrored_features(sign))
             middle = [0.5 * (matrix + matrix[swap][:, swap]) for matrix in middle]
             last = 0.5 * (last + sign[:, None] * last[:, swap])
         return [matrix.to(precision) for matrix in (first, *middle, last)]

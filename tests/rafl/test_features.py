@@ -113,6 +113,11 @@ def test_mirrored_motion_meets_the_mirrored_force(
         assert np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max()) == mirrored
 
 
+def test_units_that_cannot_change_places_are_refused() -> None:
+    with pytest.raises(ValueError, match="multiple of 8, got 20"):
+        ResidualField(width=20)
+
+
 def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
     model, simulator = field
     q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
