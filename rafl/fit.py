@@ -26,6 +26,7 @@ from rafl.run import (
     save_model,
     save_tensors,
     stale,
+    understood,
     write_history,
 )
 from rafl.targets import can_be_followed
@@ -290,11 +291,12 @@ class _Training:
 
     def _resume(self) -> None:
         saved = load_tensors(self.run / CHECKPOINT, "a checkpoint of this run")
-        self.field.restore(saved["field"])
-        self.optimiser.load_state_dict(saved["optimiser"])
-        self.schedule.load_state_dict(saved["schedule"])
-        self.shuffle.set_state(saved["shuffle"])
-        self.history = saved["history"]
+        with understood("a checkpoint of this version", self.run / CHECKPOINT):
+            self.field.restore(saved["field"])
+            self.optimiser.load_state_dict(saved["optimiser"])
+            self.schedule.load_state_dict(saved["schedule"])
+            self.shuffle.set_state(saved["shuffle"])
+            self.history = [{**row} for row in saved["history"]]
 
     def _save(self, best: bool) -> None:
         if self.group.first:

@@ -1,6 +1,7 @@
 """A run folder: the fitted model, its settings, its history and where to resume."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -140,6 +141,20 @@ def load_tensors(path: Path, what: str) -> dict:
     return content
 
 
+@contextmanager
+def understood(what: str, path: Path) -> Iterator[None]:
+    """Where what `load_tensors` found is taken apart: other contents than expected are the file's fault.
+
+    Raises:
+        InputError: something is missing, or weights have other names or shapes.
+    """
+    try:
+        yield
+    except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
+        reason = str(error).splitlines()[-1].strip() if str(error) else type(error).__name__
+        raise InputError(f"expected {what} in {path}, found other contents: {reason:.120}; fit again") from None
+
+
 def save_model(run: Path, model: FittedModel) -> None:
     """Write `model.pt`."""
     content: dict[str, object] = {"format": FORMAT, "method": model.method}
@@ -170,16 +185,13 @@ def load_model(run: Path) -> FittedModel:
             f"expected an integrator and substeps in {run / 'model.pt'}, found {stepping!r:.80}; fit again"
         )
     network = field = None
-    try:
+    with understood("weights of this version", run / "model.pt"):
         if "network" in content:
             network = GlobalResidual(content["nodes"])
             network.load_state_dict(content["network"])
         if "field" in content:
             field = ResidualField()
             field.restore(content["field"])
-    except RuntimeError as error:  # other names or shapes of weights
-        reason = str(error).splitlines()[-1].strip()
-        raise InputError(f"expected weights of this version in {run / 'model.pt'}: {reason:.120}; fit again") from None
     return FittedModel(content["method"], field, material, network, stepping)
 
 

@@ -17,7 +17,7 @@ from rafl.dataset import Dataset
 from rafl.errors import SimulationError
 from rafl.fit import Report, batches, mean_error, prepared, training_items, validation_batches
 from rafl.objective import training_loss
-from rafl.run import FORMAT, FittedModel, Settings, load_tensors, save_model, save_tensors, write_history
+from rafl.run import FORMAT, FittedModel, Settings, load_tensors, save_model, save_tensors, understood, write_history
 
 Array = NDArray[Any]
 
@@ -117,7 +117,8 @@ class _Search:
         self.file = run / "checkpoint.pt"
         if self.file.exists():
             saved = load_tensors(self.file, "a checkpoint of this run")
-            self.known = {tuple(asked): (loss, slope) for asked, loss, slope in saved["known"]}
+            with understood("what was tried", self.file):
+                self.known = {tuple(asked): (loss, slope) for asked, loss, slope in saved["known"]}
 
     def see(self, share: float) -> None:
         """Simulate a share of the frames from now on."""

@@ -17,7 +17,7 @@ from rafl.dataset import Dataset
 from rafl.errors import SimulationError
 from rafl.integrator import INTEGRATORS, State
 from rafl.objective import Recordings
-from rafl.run import FORMAT, load_tensors, save_tensors
+from rafl.run import FORMAT, load_tensors, save_tensors, understood
 from rafl.simulator import Simulator
 
 Array = NDArray[Any]
@@ -107,7 +107,8 @@ def training_targets(dataset: Dataset, path: Path, most: int | None = None) -> t
         content = {key: torch.from_numpy(getattr(targets, key))[shown] for key in ("q", "v", "force")}
         save_tensors(path, {"format": FORMAT, "method": "residual forces", **content})
     saved = load_tensors(path, "residual forces of this run")
-    return saved["q"], saved["v"], saved["force"]
+    with understood("residual forces of this run", path):
+        return saved["q"], saved["v"], saved["force"]
 
 
 @dataclass(frozen=True)

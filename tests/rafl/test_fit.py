@@ -273,6 +273,17 @@ def test_weights_of_another_version_are_refused(method: str, dataset: Dataset, t
         load_model(tmp_path)
 
 
+@pytest.mark.parametrize("part", ["field", "optimiser", "shuffle", "history"])
+def test_a_checkpoint_with_other_contents_is_refused(part: str, dataset: Dataset, tmp_path: Path) -> None:
+    settings = Settings("rafl", ("a.h5",), 1, 1e-3, 0.0, 5, 0, 0)
+    fit_residual_field([dataset], settings, tmp_path, silent)
+    content = load_tensors(tmp_path / "checkpoint.pt", "a checkpoint")
+    content[part] = [{"epoch": 1.0}, 3] if part == "history" else {"unknown": torch.zeros(3)}
+    save_tensors(tmp_path / "checkpoint.pt", content)
+    with pytest.raises(InputError, match=r"a checkpoint of this version in .*checkpoint\.pt, found .*fit again"):
+        fit_residual_field([dataset], replace(settings, epochs=2), tmp_path, silent)
+
+
 def test_nothing_to_train_on_is_refused(dataset: Dataset) -> None:
     items = {name: replace(item, split="test") for name, item in dataset.trajectories.items()}
     with pytest.raises(InputError, match="split `train`"):
