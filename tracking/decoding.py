@@ -1,5 +1,6 @@
 """Frames out of a video file, decoded packet by packet; what is damaged is left out."""
 
+import gc
 import heapq
 import logging
 from collections import deque
@@ -25,9 +26,9 @@ logging.getLogger("libav").propagate = False
 # What makes FFmpeg's decoders report damage instead of painting over it, and how coarsely a picture was coded.
 STRICT = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data": "venc_params"}
 H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
-# Frames of which one is asked how it was coded: kinds of frames come in fours and twelves. Its side data and a frame
-# hold on to each other until Python's collector passes, and a decoder that has to take fresh memory is a third slower.
+# Frames of which one is asked how it was coded: kinds of frames come in fours and twelves.
 ASKED = 7
+STEPS = 0.625 * 2.0 ** (np.arange(-64, 128) / 6.0)  # by quantiser, from -64
 # Decoders that refuse what is damaged, and need not be heard: this one writes dozens of lines a frame into its log, for
 # each of which PyAV waits for Python's lock, though nobody is to see them.
 OPEN = {"mjpeg"}
@@ -97,14 +98,19 @@ def _frames(container: "av.container.InputContainer", notes: list[str]) -> Itera
         frames, trouble = _decoded(packet)
         if trouble:
             order.spoil(packet.pts)
-        for frame in frames:
-            picture = None if frame.is_corrupt else _grey(frame)
+        while frames:
+            frame = frames.pop(0)
+            stamp, picture = frame.pts, None if frame.is_corrupt else _grey(frame)
             if shape is None and picture is not None:
                 shape = picture.shape
             if picture is None or picture.shape != shape:  # damage may turn pictures, too
-                order.spoil(frame.pts)
-            steps = _steps(frame) if tells and number % ASKED == 0 else None
-            yield from order.shown(_Decoded(frame.pts, picture, steps))
+                order.spoil(stamp)
+            steps = None
+            if tells and number % ASKED == 0 and picture is not None:
+                steps = _steps(frame)
+                del frame
+                gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
+            yield from order.shown(_Decoded(stamp, picture, steps))
             number += 1
     yield from order.rest()
 
@@ -310,7 +316,7 @@ def _steps(frame: "av.VideoFrame") -> NDArray | None:
         if kind != H264_PARAMETERS or count != rows * columns or size % 4:
             continue
         blocks = np.frombuffer(data, np.int32, count * size // 4, offset).reshape(rows, columns, -1)
-        steps = 0.625 * 2.0 ** ((quantiser + blocks[..., 4]) / 6.0)
+        steps = STEPS[np.clip(quantiser + blocks[..., 4], -64, 127) + 64]
         if turns := quarter_turns(frame):
             whole = np.kron(steps, np.ones((MACROBLOCK, MACROBLOCK)))[: frame.height, : frame.width]
             half = MACROBLOCK // 2

@@ -17,6 +17,7 @@ Array = NDArray[Any]
 
 PARAMETERS = 12  # centre (2), A (3: xx, xy, yy), W (3: xx, xy, yy) [px^2], contrast, level, slopes of the light (2)
 LARGEST = 8192  # pixels a fit looks at
+LINE = 64  # pixels that memory gives at a time
 CHUNK = 256  # pixels whose derivatives are held at a time, so that they stay in the nearest cache
 
 # Rows of a fit's scratch, one array: so the compiler sees that no two of them overlap.
@@ -24,7 +25,7 @@ X, Y, VALUE, WEIGHT, RESIDUAL, SIZE = (LARGEST * row for row in range(6))
 BLOCK_OF = SIZE  # at another time
 J = 6 * LARGEST  # a chunk's derivatives by the parameters, 12 rows, its residual, and 3 rows never looked at
 WEIGHTED = J + 16 * CHUNK
-SCRATCH = WEIGHTED + CHUNK
+SCRATCH = WEIGHTED + 2 * CHUNK
 LEAST_BLUR, MOST_BLUR = 0.08, 40.0  # of W along any direction [px^2]
 REACH = 4.0  # half the bell curve's support, in standard deviations
 
@@ -61,28 +62,37 @@ def choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
     margin = (1.0 + edge) / smallest + 0.3
     inside, outside, end = max(1.0 - edge / smallest, 0.0) ** 2, (1.0 + edge / smallest) ** 2, (1.0 + margin) ** 2
     window = int(largest * (1.0 + margin)) + 1
+    # |A d|^2 = along (dx + lean dy)^2 + across dy^2
+    along = p[2] * p[2] + p[3] * p[3]
+    lean = p[3] * (p[2] + p[4]) / along
+    across = p[3] * p[3] + p[4] * p[4] - along * lean * lean
+    top, bottom = max(y0 - window, 0), min(y0 + window + 1, height)
+    left, right = max(x0 - window, 0), min(x0 + window, width - 1)
+    touched = 0
+    for row in range(top, bottom):  # asks for all rows at once, of a picture that no cache holds yet
+        for column in range(left, right, LINE):
+            touched += image[row, column]
+        touched += image[row, max(right, 0)]
+    w[SIZE] = touched
     count = 0
-    fx, fy = p[0] - x0, p[1] - y0
-    for row in range(max(y0 - window, 0), min(y0 + window + 1, height)):
-        for column in range(max(x0 - window, 0), min(x0 + window + 1, width)):
-            dx, dy = column - x0 - fx, row - y0 - fy
-            ax, ay = p[2] * dx + p[3] * dy, p[3] * dx + p[4] * dy
-            r2 = ax * ax + ay * ay
-            if r2 > end or ((r2 < inside or r2 > outside) and (row + column) & 1):
-                continue
-            taken = False
+    for row in range(top, bottom):
+        least = across * (row - p[1]) ** 2
+        if least > end:
+            continue
+        middle, reach = p[0] - lean * (row - p[1]), np.sqrt((end - least) / along)
+        first, last = max(int(np.ceil(middle - reach)), 0), min(int(np.floor(middle + reach)), width - 1)
+        if count + last - first >= LARGEST - CHUNK:
+            return 0
+        for column in range(first, last + 1):
+            r2 = least + along * (column - middle) ** 2
+            skipped = ((r2 < inside) | (r2 > outside)) & ((row + column) & 1)
             for k in range(near.shape[0]):
                 ex, ey = column - near[k, 0], row - near[k, 1]
-                if ex * ex + ey * ey < (near[k, 2] + 3.0) ** 2:
-                    taken = True
-            if taken:
-                continue
-            if count == LARGEST - CHUNK:
-                return 0
+                skipped |= ex * ex + ey * ey < (near[k, 2] + 3.0) ** 2
             w[X + count] = column - x0
             w[Y + count] = row - y0
             w[VALUE + count] = image[row, column]
-            count += 1
+            count += 1 - skipped  # no branch: where the pattern ends is nothing that a processor can foresee
     return count
 
 

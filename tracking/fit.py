@@ -107,21 +107,24 @@ def _add_influence(first, count, w, pull, white, blocks):  # type: ignore[no-unt
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
     for axis in range(2):
+        influence = WEIGHTED + axis * CHUNK
         for k in range(count):
-            w[WEIGHTED + k] = np.float32(0.0)
+            w[influence + k] = np.float32(0.0)
         for i in range(PARAMETERS):
             factor = np.float32(pull[axis, i])
             row = J + i * CHUNK
             for k in range(count):
-                w[WEIGHTED + k] += factor * w[row + k]
+                w[influence + k] += factor * w[row + k]
         total = np.float32(0.0)
         for k in range(count):
-            w[WEIGHTED + k] *= w[WEIGHT + first + k]
-            total += w[WEIGHTED + k] * w[WEIGHTED + k]
-            w[WEIGHTED + k] *= w[J + 12 * CHUNK + k]
+            w[influence + k] *= w[WEIGHT + first + k]
+            total += w[influence + k] * w[influence + k]
+            w[influence + k] *= w[J + 12 * CHUNK + k]
         white[axis] += total
-        for k in range(count):
-            blocks[axis, int(w[BLOCK_OF + first + k])] += w[WEIGHTED + k]
+    for k in range(count):
+        block = int(w[BLOCK_OF + first + k])
+        blocks[0, block] += w[WEIGHTED + k]
+        blocks[1, block] += w[WEIGHTED + CHUNK + k]
 
 
 @njit(**FAST)

@@ -2,6 +2,7 @@
 
 import heapq
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -101,11 +102,13 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
             f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in a frame, found {most} at most; "
             "check that dots of 3 to 32 px radius contrast with the skin"
         )
-    paths, fitted, leverage, step = _whole(seen, late, len(tracker.pattern.rest))
-    sigma = with_coding_errors(paths, with_shared_errors(paths, fitted), leverage, step)
+    with ThreadPoolExecutor(1) as aside:
+        pictures = aside.submit(album.pictures)
+        paths, fitted, leverage, step = _whole(seen, late, len(tracker.pattern.rest))
+        sigma = with_coding_errors(paths, with_shared_errors(paths, fitted), leverage, step)
     return PixelTracks(
         np.array(times), paths, sigma, tracker.pattern.rest, len(late), np.array(damaged),
-        album.pictures(), tuple(reading.notes),
+        pictures.result(), tuple(reading.notes),
     )  # fmt: skip
 
 

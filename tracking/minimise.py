@@ -29,26 +29,41 @@ def add_products(first, count, w, H):  # type: ignore[no-untyped-def]
     """Adds a chunk of linearised pixels to H (13, 16)."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
-    for i in range(PARAMETERS + 1):
+    for i in range(0, PARAMETERS, 2):  # two rows by four columns at once: what is loaded serves more than once
         row = J + i * CHUNK
         for k in range(count):
-            w[WEIGHTED + k] = w[WEIGHT + first + k] * w[row + k]
-        for j in range(0, i + 1, 4):  # past the diagonal too: four sums at once are as fast as one
+            weight = w[WEIGHT + first + k]
+            w[WEIGHTED + k] = weight * w[row + k]
+            w[WEIGHTED + CHUNK + k] = weight * w[row + CHUNK + k]
+        for j in range(0, i + 2, 4):  # past the diagonal too
             column = J + j * CHUNK
-            sum0 = np.float32(0.0)
-            sum1 = np.float32(0.0)
-            sum2 = np.float32(0.0)
-            sum3 = np.float32(0.0)
+            sum00 = sum01 = sum02 = sum03 = np.float32(0.0)
+            sum10 = sum11 = sum12 = sum13 = np.float32(0.0)
             for k in range(count):
-                factor = w[WEIGHTED + k]
-                sum0 += factor * w[column + k]
-                sum1 += factor * w[column + CHUNK + k]
-                sum2 += factor * w[column + 2 * CHUNK + k]
-                sum3 += factor * w[column + 3 * CHUNK + k]
-            H[i, j] += sum0
-            H[i, j + 1] += sum1
-            H[i, j + 2] += sum2
-            H[i, j + 3] += sum3
+                factor0 = w[WEIGHTED + k]
+                factor1 = w[WEIGHTED + CHUNK + k]
+                value0 = w[column + k]
+                value1 = w[column + CHUNK + k]
+                value2 = w[column + 2 * CHUNK + k]
+                value3 = w[column + 3 * CHUNK + k]
+                sum00 += factor0 * value0
+                sum01 += factor0 * value1
+                sum02 += factor0 * value2
+                sum03 += factor0 * value3
+                sum10 += factor1 * value0
+                sum11 += factor1 * value1
+                sum12 += factor1 * value2
+                sum13 += factor1 * value3
+            H[i, j] += sum00
+            H[i, j + 1] += sum01
+            H[i, j + 2] += sum02
+            H[i, j + 3] += sum03
+            H[i + 1, j] += sum10
+            H[i + 1, j + 1] += sum11
+            H[i + 1, j + 2] += sum12
+            H[i + 1, j + 3] += sum13
+    squares, _ = add_scores(first, count, w, H[PARAMETERS])
+    H[PARAMETERS, PARAMETERS] += squares
 
 
 @njit(**FAST)

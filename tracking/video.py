@@ -18,7 +18,10 @@ from tracking.frame import Frame, scaled
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg", ".mpeg", ".ts"}
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
-AHEAD = 6  # pictures decoded before they are asked for
+# Pictures decoded before they are asked for, as the first takes its time: how many handfuls of how many bytes. Two
+# threads that wait for each other at every picture lose a twentieth of their time.
+HANDFULS, HANDFUL = 6, 2**23
+SMALL = 2**20  # bytes that a lost picture counts for
 
 
 @dataclass
@@ -149,11 +152,11 @@ def _folder_frames(folder: Path) -> Iterator[Frame]:
 
 
 def _ahead(source: Iterator[Frame]) -> Iterator[Frame]:
-    """The same frames, made in a thread of their own."""
-    made: queue.Queue[Frame | BaseException | None] = queue.Queue(AHEAD)
+    """The same frames, made in a thread of their own and handed over by the handful."""
+    made: queue.Queue[list[Frame] | BaseException | None] = queue.Queue(HANDFULS)
     stopped = threading.Event()
 
-    def put(item: Frame | BaseException | None) -> None:
+    def put(item: list[Frame] | BaseException | None) -> None:
         while not stopped.is_set():
             try:
                 made.put(item, timeout=0.2)
@@ -162,14 +165,22 @@ def _ahead(source: Iterator[Frame]) -> Iterator[Frame]:
             return
 
     def work() -> None:
+        handful: list[Frame] = []
+        size = 0
         try:
             for frame in source:
-                put(frame)
+                handful.append(frame)
+                size += SMALL if frame.picture is None else frame.picture.nbytes
+                if size >= HANDFUL:
+                    put(handful)
+                    handful, size = [], 0
                 if stopped.is_set():
                     return
+            put(handful)
+            put(None)
         except Exception as error:  # handed to whoever reads
+            put(handful)
             put(error)
-        put(None)
 
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
@@ -177,7 +188,9 @@ def _ahead(source: Iterator[Frame]) -> Iterator[Frame]:
         while (item := made.get()) is not None:
             if isinstance(item, BaseException):
                 raise item
-            yield item
+            item.reverse()
+            while item:
+                yield item.pop()  # and keeps no picture that nobody else does
     finally:
         stopped.set()
         thread.join()
