@@ -41,7 +41,7 @@ from rafl.targets import PENALTY, residual_targets
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
 SPECIMENS = EXPERIMENTS.parent / "specimens"
 LARGE = 1000  # vertices: such a shape is fine-tuned for fewer epochs of fewer frames, and left out by --quick
-LARGE_FRAMES = 50
+LARGE_FRAMES, LARGE_RATE = 50, 8e-3
 BEAMS = ("canonical", "longer", "shorter", "thicker", "thinner")
 COLUMNS = ["shape", "method", "mean_mm", "std_mm", "paper_mean_mm", "paper_std_mm"]
 
@@ -57,7 +57,7 @@ class Effort:
     fine_large: int | None  # None leaves large shapes out, 0 only evaluates there
 
 
-FULL, QUICK = Effort(60, 1000, 40, 30, 5), Effort(20, 150, 8, 5, None)
+FULL, QUICK = Effort(60, 1000, 40, 30, 12), Effort(20, 150, 8, 5, None)
 
 
 class Study:
@@ -184,8 +184,8 @@ class Study:
             if not epochs:
                 continue
             own = [self.dataset(shape, "train", "val")]
-            frames = LARGE_FRAMES if large else 0
-            tuned = self.fit(f"fine-{shape}", "rafl", own, epochs=epochs, start=start, frames=frames, force_penalty=0.0)
+            how = {"frames": LARGE_FRAMES, "learning_rate": LARGE_RATE} if large else {}
+            tuned = self.fit(f"fine-{shape}", "rafl", own, epochs=epochs, start=start, force_penalty=0.0, **how)
             found = self.errors(shape, {"rafl-fine-tuned": tuned})
             rows += [{**row, "shape": f"{shape}"} for row in found if row["method"] == "rafl-fine-tuned"]
         return pd.DataFrame(rows, columns=COLUMNS)
