@@ -1,5 +1,6 @@
 """Hexahedral meshes: vertices, cells, quadrature and boundary."""
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -127,12 +128,21 @@ class HexMesh:
         every = np.sort(self.hexes[:, pairs].reshape(-1, 2), axis=1)
         return np.unique(every, axis=0)
 
+    @cached_property
+    def edge_lengths(self) -> NDArray[np.float64]:
+        """At rest [m], (K)."""
+        first, second = self.edges.T
+        return np.asarray(np.linalg.norm(self.vertices[first] - self.vertices[second], axis=1))
+
     def stretching(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
         """By how much of its length at rest a displacement (B, N, 3) changes the edge that it changes most, (B)."""
         first, second = self.edges.T
-        length = np.linalg.norm(self.vertices[first] - self.vertices[second], axis=1)
         change = displacement[:, first] - displacement[:, second]
-        return np.sqrt(((change**2).sum(-1) / length**2).max(axis=1))
+        return np.sqrt(((change**2).sum(-1) / self.edge_lengths**2).max(axis=1))
+
+    def stretching_at_most(self, farthest: NDArray[np.float64]) -> NDArray[np.float64]:
+        """What no displacement stretches more than whose components are at most `farthest` [m], (B), sooner found."""
+        return 2.0 * math.sqrt(3.0) * farthest / float(self.edge_lengths.min())
 
     def mirrors(self, held: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the plane across each axis (3), through the middle, maps the cells and the vertices `held` onto

@@ -58,7 +58,10 @@ def minimise(
         found = _descend(*problem, LONGEST)
     except SimulationError:
         found = _descend(*problem, np.inf)  # from a start so squeezed that only a leap leads out
-    torn = engine.mesh.stretching(found - engine.mesh.vertices)
+    moved = found - engine.mesh.vertices
+    if (engine.mesh.stretching_at_most(np.abs(moved).max(axis=(1, 2))) < TORN).all():
+        return found
+    torn = engine.mesh.stretching(moved)
     if not (torn < TORN).all():
         raise SimulationError(
             f"{what}: trajectory {int(np.argmax(torn))} is torn apart (an edge changed by {torn.max():.3g} times its "
@@ -109,8 +112,11 @@ def _descend(
             _factor(engine, at, resistance.rows(new), factors, new, diagonal[new], what, largest[new])
         step = -engine.solve(factors, running, residual[running][:, None])[:, 0]
         slope = _dot(step, residual[running])
-        change = engine.mesh.stretching(_scattered(step, free, q.shape[1]))
-        length = np.minimum(1.0, longest / np.maximum(change, 1e-300))
+        length = np.ones(len(running))
+        far = np.flatnonzero(engine.mesh.stretching_at_most(np.abs(step).max(axis=1)) > longest)
+        if len(far):
+            change = engine.mesh.stretching(_scattered(step[far], free, q.shape[1]))
+            length[far] = np.minimum(1.0, longest / np.maximum(change, 1e-300))
         pending = np.arange(len(running))
         for _ in range(40):
             rows = running[pending]

@@ -101,6 +101,20 @@ def test_planes_of_symmetry() -> None:
     assert HexMesh(bent, notched.hexes).mirrors(nothing).tolist() == [False, False, False]
 
 
+def test_edges_stretch() -> None:
+    """A pull of 10 % along x; nodes that move apart by a known way; never more than the quick bound says."""
+    mesh = HexMesh.box((3, 2, 2), (0.06, 0.02, 0.01))
+    pulled = 0.1 * mesh.vertices * [1.0, 0.0, 0.0]
+    alone = np.zeros_like(mesh.vertices)
+    alone[0] = [0.001, 0.002, -0.002]
+    both = np.stack([pulled, alone])
+    np.testing.assert_allclose(mesh.stretching(both), [0.1, 0.003 / 0.005])
+    random = np.random.default_rng(3).uniform(-1e-3, 1e-3, (50, *mesh.vertices.shape))
+    assert (mesh.stretching(random) <= mesh.stretching_at_most(np.abs(random).max(axis=(1, 2)))).all()
+    apart = np.where(mesh.vertices.sum(axis=1, keepdims=True) > 0.03, 1e-3, -1e-3) * np.ones(3)
+    assert mesh.stretching_at_most(np.array([1e-3])) == pytest.approx(mesh.stretching(apart[None]))
+
+
 @pytest.mark.parametrize("damage", ["inverted", "flat"])
 def test_bad_cells_are_refused_by_index(damage: str) -> None:
     mesh = HexMesh.box((3, 1, 1), (0.03, 0.01, 0.01))
