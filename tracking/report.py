@@ -57,7 +57,7 @@ def summary_cells(tracks: Tracks) -> list[str]:
     """Frames, markers, shares measured, filled and missing, median sigma and residual, as text."""
     state = tracks.state
     sigma = np.concatenate([values[np.isfinite(values)] for values in tracks.pixel_sigma.values()])
-    residual = np.concatenate([values[np.isfinite(values)] for values in tracks.residual.values()])
+    residual = np.concatenate([_compared(tracks, camera) for camera in tracks.residual])
     return [
         str(len(tracks.time)),
         str(len(tracks.names)),
@@ -65,6 +65,12 @@ def summary_cells(tracks: Tracks) -> list[str]:
         f"{np.median(sigma):.3f}" if len(sigma) else "-",
         f"{np.sqrt((residual**2).mean()):.3f}" if len(residual) else "-",
     ]
+
+
+def _compared(tracks: Tracks, camera: str) -> NDArray:
+    """One camera's residuals [px] where another sees the marker too: what one alone sees has nothing to differ from."""
+    seen = np.sum([np.isfinite(residual) for residual in tracks.residual.values()], axis=0)
+    return tracks.residual[camera][np.isfinite(tracks.residual[camera]) & (seen > 1)]
 
 
 def write_report(path: Path, tracks: dict[str, Tracks], rig: Rig) -> None:
@@ -137,13 +143,16 @@ def _timeline(tracks: Tracks) -> str:
 
 def _histogram(tracks: Tracks, name: str) -> str:
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 2.4), layout="constrained")
-    for axes, values, label in (
-        (left, tracks.residual[name], "reprojection residual [px]"),
-        (right, tracks.pixel_sigma[name], "standard deviation of a coordinate [px]"),
+    sigma = tracks.pixel_sigma[name]
+    for axes, values, label, nothing in (
+        (left, _compared(tracks, name), "reprojection residual [px]", "no marker is seen by another camera too"),
+        (right, sigma[np.isfinite(sigma)], "standard deviation of a coordinate [px]", "no marker is seen"),
     ):
-        known = values[np.isfinite(values)]
-        if len(known):
-            axes.hist(known, bins=60, range=(0.0, float(np.quantile(known, 0.995)) + 1e-9), color="#1f6fb2")
+        if len(values):
+            axes.hist(values, bins=60, range=(0.0, float(np.quantile(values, 0.995)) + 1e-9), color="#1f6fb2")
+        else:
+            axes.text(0.5, 0.5, nothing, ha="center", va="center", transform=axes.transAxes, color="#666666")
+            axes.set_xticks([])
         axes.set_xlabel(label)
         axes.set_yticks([])
     return _png(figure)

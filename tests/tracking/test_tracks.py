@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from groundwork import InputError
+from tracking.report import summary_cells
 from tracking.tracks import Tracks, read_tracks, write_tracks
 
 
@@ -46,6 +47,17 @@ def test_round_trip(tracks: Tracks, tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(back, key)["left"], getattr(tracks, key)["left"])
     for key in ("names", "fps", "calibration", "sources", "settings", "notes", "pictures", "version"):
         assert getattr(back, key) == getattr(tracks, key)
+
+
+def test_only_markers_that_two_cameras_see_have_a_residual(tracks: Tracks) -> None:
+    """A marker that one camera alone sees lies in its plane, and just where that camera sees it."""
+    assert summary_cells(tracks) == ["7", "4", "92.9%", "3.6%", "3.6%", "0.020", "-"]
+    right = np.full((7, 4), np.nan)
+    right[:, 2] = 0.3
+    left = np.zeros((7, 4))
+    left[:, 2] = 0.1
+    both = replace(tracks, residual={"left": left, "right": right})
+    assert summary_cells(both)[-1] == f"{np.sqrt(0.05):.3f}"
 
 
 def test_other_files_are_refused(tracks: Tracks, tmp_path: Path) -> None:
