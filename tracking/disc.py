@@ -23,8 +23,8 @@ CHUNK = 256  # pixels whose derivatives are held at a time, so that they stay in
 # Rows of a fit's scratch, one array: so the compiler sees that no two of them overlap.
 X, Y, VALUE, WEIGHT, RESIDUAL, SIZE = (LARGEST * row for row in range(6))
 BLOCK_OF = SIZE  # at another time
-J = 6 * LARGEST  # a chunk's derivatives by the parameters, 12 rows, its residual, and 3 rows never looked at
-WEIGHTED = J + 16 * CHUNK
+J = 6 * LARGEST  # a chunk's derivatives by the parameters, 12 rows, and its residual
+WEIGHTED = J + 13 * CHUNK  # two rows
 SCRATCH = WEIGHTED + 2 * CHUNK
 LEAST_BLUR, MOST_BLUR = 0.08, 40.0  # of W along any direction [px^2]
 REACH = 4.0  # half the bell curve's support, in standard deviations

@@ -135,7 +135,7 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
     """
     n = PARAMETERS
     quality[:] = 0.0
-    H = np.empty((n + 1, n + 4))
+    H = np.empty((n + 1, n + 1))
     L = np.empty((n, n))
     smeared = False
     away = 1.0 + 2.0 / np.sqrt(max(p[2] * p[4] - p[3] * p[3], 1e-12))

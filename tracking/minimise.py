@@ -16,7 +16,7 @@ WORTHLESS = 1.0  # of a pixel's mean squared residual: a gain that says nothing 
 
 @njit(**FAST)
 def normal_equations(p, smeared, x0, y0, count, w, H):  # type: ignore[no-untyped-def]
-    """Fills H (13, 16), lower triangle: J W J^T; its last row ends in the weighted squared residual."""
+    """Fills H (13, 13), lower triangle: J W J^T; its last row ends in the weighted squared residual."""
     H[:] = 0.0
     for first in range(0, count, CHUNK):
         some = min(CHUNK, count - first)
@@ -26,7 +26,7 @@ def normal_equations(p, smeared, x0, y0, count, w, H):  # type: ignore[no-untype
 
 @njit(**FAST)
 def add_products(first, count, w, H):  # type: ignore[no-untyped-def]
-    """Adds a chunk of linearised pixels to H (13, 16)."""
+    """Adds a chunk of linearised pixels to H (13, 13)."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
     for i in range(0, PARAMETERS, 2):  # two rows by four columns at once: what is loaded serves more than once

@@ -40,7 +40,7 @@ from rafl.targets import PENALTY, residual_targets
 
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
 SPECIMENS = EXPERIMENTS.parent / "specimens"
-LARGE = 1000  # vertices: such a shape is fine-tuned for fewer epochs of fewer frames, and left out by --quick
+LARGE = 1000  # vertices: fine-tuned for fewer epochs of fewer frames at another rate; left out by --quick
 LARGE_FRAMES, LARGE_RATE = 50, 8e-3
 BEAMS = ("canonical", "longer", "shorter", "thicker", "thinner")
 COLUMNS = ["shape", "method", "mean_mm", "std_mm", "paper_mean_mm", "paper_std_mm"]
