@@ -61,7 +61,7 @@ def fit(
     learning_rate: Annotated[float, typer.Option(min=1e-8, help="Adam's, at the start (rafl).")] = 1e-3,
     weight_decay: Annotated[float, typer.Option(min=0.0, help="Adam's (rafl, srl).")] = 1e-5,
     patience: Annotated[int, typer.Option(min=1, help="Epochs without gain before stopping (rafl).")] = 20,
-    frames: Annotated[int, typer.Option(min=0, help="Leading frames to train on (0: all).")] = 0,
+    frames: Annotated[int, typer.Option(min=0, help="Leading frames to simulate in training (0: all).")] = 0,
     seed: Annotated[int, typer.Option(help="Of weights and order (rafl, srl).")] = 0,
     batch: Annotated[int, typer.Option(min=1, help="Recordings an update (rafl); torchrun shares them out.")] = 1,
     force_penalty: Annotated[float, typer.Option(min=0.0, help="On squared residual forces [m2/N2] (rafl).")] = 1e-8,

@@ -143,9 +143,8 @@ def _trained_on(datasets: list[Dataset], settings: Settings) -> tuple[FittedMode
 
 def nothing_to_follow(datasets: list[Dataset], settings: Settings) -> bool:
     """Whether a warm start is wanted that no dataset's simulator, as it will be trained with, can give."""
-    start, used = _trained_on(datasets, settings)
-    wanted = settings.warm_start > 0 and start.field is None
-    return wanted and not any(can_be_followed(dataset.simulator) for dataset in used)
+    _, used = _trained_on(datasets, settings)
+    return settings.warm_start > 0 and not any(can_be_followed(dataset.simulator) for dataset in used)
 
 
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
@@ -180,14 +179,20 @@ class _Training:
     ) -> None:
         self.settings, self.run, self.group = settings, run, group
         self.report: Report = report if group.first else lambda row: None
-        start, datasets = _trained_on(datasets, settings)
+        whole = datasets
+        start, datasets = _trained_on(whole, settings)
         self.items, self.validate = training_items(datasets), validation_batches(datasets)
         self.history: list[dict[str, float]] = []
         torch.manual_seed(settings.seed)
         self.field = ResidualField() if start.field is None else start.field
         self.model = FittedModel("rafl", self.field, start.material, stepping=datasets[0].simulator.stepping)
-        if start.field is None and not (run / CHECKPOINT).exists():
-            self._teach(datasets)
+        if not (run / CHECKPOINT).exists():
+            if start.field is None:
+                self._prepare(datasets)
+            warm_start(
+                self.field, _trained_on(whole, replace(settings, frames=0))[1], run, settings.warm_start, settings.seed,
+                lambda: 1e3 * mean_error(self.validate, self.model), self.report, learned=start.field is not None,
+            )  # fmt: skip
         self.optimiser = torch.optim.Adam(
             self.field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
@@ -196,17 +201,13 @@ class _Training:
         )
         self.shuffle = torch.Generator().manual_seed(settings.seed)
 
-    def _teach(self, datasets: list[Dataset]) -> None:
-        """A new field's symmetry, scale and first lesson."""
+    def _prepare(self, datasets: list[Dataset]) -> None:
+        """A new field's symmetry and scale."""
         taught = [dataset for dataset in datasets if dataset.split("train")]
         mirrors = np.logical_and.reduce([dataset.simulator.mirrors for dataset in taught])
         self.field.mirror(torch.from_numpy(mirrors))
         samples = torch.cat([_sample_features(dataset) for dataset in taught])
         self.field.scale_to(samples.square().mean(0).sqrt())
-        warm_start(
-            self.field, datasets, self.run, self.settings.warm_start, self.settings.seed,
-            lambda: 1e3 * mean_error(self.validate, self.model), self.report,
-        )  # fmt: skip
 
     def go(self) -> FittedModel:
         """Train to the end."""

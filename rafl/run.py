@@ -70,7 +70,7 @@ class Settings:
         learning_rate: Adam's, at the start of the cosine decay.
         weight_decay: Adam's.
         patience: epochs without a better validation error before training stops.
-        frames: leading frames of each recording used for training (all when 0).
+        frames: leading frames of each recording that training simulates (all when 0); a warm start follows all.
         seed: of the initial weights and the order of recordings.
         batch: recordings an update.
         force_penalty: the paper's lambda_1 [m^2/N^2].

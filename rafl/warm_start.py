@@ -1,4 +1,4 @@
-"""A residual field's first weights from the least forces that let the simulator follow the recordings step by step.
+"""A residual field's first lesson: the least forces that let the simulator follow the recordings step by step.
 
 Fitting the field to these forces takes no simulation. What a wrong force would do is measured by the work it would do
 on the body at rest, which weighs bending and the stiff cross-sections fairly. End-to-end training starts from there.
@@ -15,41 +15,53 @@ from torch import Tensor
 
 from rafl.dataset import Dataset
 from rafl.errors import SimulationError
+from rafl.features import FEATURES
 from rafl.field_force import FieldPoints, accelerations
 from rafl.field_kernels import KEPT_TURN
 from rafl.residual import ResidualField
+from rafl.simulator import Simulator
 from rafl.targets import can_be_followed, training_targets
 
 RATE = 3e-3  # Adam's, at the start of the cosine decay
 DECAY = 0.3  # of the weights, a unit of rate: without it the field is wilder on shapes it has not seen
 BATCH = 16  # states an update
 MARKERS = 48  # that are followed at most: more tell hardly more
-LARGEST = 1000  # vertices: beyond, the body's compliance does not fit as a full matrix
+LARGEST = 4000  # vertices: beyond, the body's compliance does not fit as a full matrix
+MOST_POINTS = 8_000_000  # quadrature points of a dataset's states, 172 bytes each; of more states some are drawn
+TOGETHER = 32  # states whose features are worked out at once
+COLUMNS = 512  # of the compliance, likewise
 
 
-class _Lesson:
+class Lesson:
     """One dataset's states, ready for updates in single precision."""
 
     def __init__(self, dataset: Dataset, targets: Path) -> None:
         simulator = dataset.simulator
         q, v, missing = (part.numpy() for part in training_targets(dataset, targets, MARKERS))
-        states, nodes = q.shape[:2]
+        nodes = q.shape[1]
         points = FieldPoints.of(simulator)
-        inputs, kept = points.features(q, v)
         each = 8 * len(points.hexes)
-        self.states = states
-        self.size = np.sqrt((inputs**2).mean(axis=1))
-        self.inputs = torch.from_numpy(inputs.astype(np.float32)).reshape(len(inputs), states, each)
-        turn = kept[:, :, KEPT_TURN : KEPT_TURN + 9].transpose(0, 1, 3, 2).reshape(states, each, 3, 3)
-        self.turn = torch.from_numpy(turn.astype(np.float32))
-        shares = np.zeros((each, nodes))
+        if len(q) * each > MOST_POINTS:
+            drawn = np.sort(np.random.default_rng(0).choice(len(q), max(MOST_POINTS // each, BATCH), replace=False))
+            q, v, missing = q[drawn], v[drawn], missing[drawn]
+        self.states = states = len(q)
+        self.inputs = torch.empty(FEATURES, states, each)
+        self.turn = torch.empty(states, each, 3, 3)
+        squares = np.zeros(FEATURES)
+        for first in range(0, states, TOGETHER):
+            some = slice(first, first + TOGETHER)
+            inputs, kept = points.features(np.ascontiguousarray(q[some]), np.ascontiguousarray(v[some]))
+            squares += (inputs**2).sum(axis=1)
+            self.inputs[:, some] = torch.from_numpy(inputs).reshape(FEATURES, -1, each)
+            turn = kept[:, :, KEPT_TURN : KEPT_TURN + 9].transpose(0, 1, 3, 2)
+            self.turn[some] = torch.from_numpy(turn).reshape(-1, each, 3, 3)
+        self.size = np.sqrt(squares / (states * each))
+        shares = np.zeros((each, nodes), np.float32)
         for cell, corners in enumerate(points.hexes):
             shares[8 * cell : 8 * cell + 8, corners] = points.shape * points.mass[cell][:, None]
         shares[:, simulator.fixed] = 0.0
-        self.shares = torch.from_numpy(shares.astype(np.float32))
-        rest = simulator.mesh.vertices[None]
-        compliance = simulator.solve_tangent(rest, np.eye(3 * nodes).reshape(1, nodes, 3, -1))[0]
-        self.compliance = torch.from_numpy(compliance.reshape(3 * nodes, -1).astype(np.float32))
+        self.shares = torch.from_numpy(shares)
+        self.compliance = _compliance(simulator)
         self.force = torch.from_numpy(missing.reshape(states, -1).astype(np.float32))
         self.work = self._work(self.force)
 
@@ -65,6 +77,16 @@ class _Lesson:
         return self._work(force - self.force[chosen]) / self.work
 
 
+def _compliance(simulator: Simulator) -> Tensor:
+    """Displacements [m] of the body at rest by unit forces on its nodes, (3 N, 3 N)."""
+    rest, size = simulator.mesh.vertices[None], 3 * len(simulator.mesh.vertices)
+    compliance = torch.empty(size, size)
+    for first in range(0, size, COLUMNS):
+        unit = np.eye(size, min(COLUMNS, size - first), -first).reshape(1, size // 3, 3, -1)
+        compliance[:, first : first + COLUMNS] = torch.from_numpy(simulator.solve_tangent(rest, unit)).reshape(size, -1)
+    return compliance
+
+
 def warm_start(
     field: ResidualField,
     datasets: list[Dataset],
@@ -73,10 +95,11 @@ def warm_start(
     seed: int,
     judge: Callable[[], float],
     report: Callable[[dict[str, float]], None],
+    learned: bool = False,
 ) -> None:
     """Fit a field, in place, to the forces that the training recordings call for.
 
-    Sets the field's scale too. Datasets that are large, or whose simulator damps by viscosity or steps otherwise than
+    Datasets that are large, or whose simulator damps by viscosity or steps otherwise than
     by backward differences, teach nothing here. What fits the recorded states best need not be stable beside them: of
     all epochs the one is kept that simulates best.
 
@@ -89,12 +112,13 @@ def warm_start(
         judge: the field's error in simulation [mm].
         report: called after each epoch with `warm_start` (its number), `missing` (the share of the missing force's
             effect, root mean square, that the field does not give) and `validation_mm`.
+        learned: whether the field goes on from an earlier training; one that does not is scaled to these states.
     """
     if epochs == 0:
         return
     try:
         lessons = [
-            _Lesson(dataset, run / f"targets-{number}.pt")
+            Lesson(dataset, run / f"targets-{number}.pt")
             for number, dataset in enumerate(item for item in datasets if item.split("train"))
             if can_be_followed(dataset.simulator) and len(dataset.simulator.mesh.vertices) <= LARGEST
         ]
@@ -102,9 +126,9 @@ def warm_start(
         raise SimulationError(f"{error}; train without following the recordings first: --warm-start 0") from None
     if not lessons:
         return
-    size = torch.from_numpy(np.sqrt(np.mean([lesson.size**2 for lesson in lessons], axis=0)))
-    with torch.no_grad():
-        field.scale_to(size)
+    if not learned:
+        with torch.no_grad():
+            field.scale_to(torch.from_numpy(np.sqrt(np.mean([lesson.size**2 for lesson in lessons], axis=0))))
     optimiser = torch.optim.AdamW(field.parameters(), lr=RATE, weight_decay=DECAY)
     order = torch.Generator().manual_seed(seed)
     batches = sum(max(lesson.states // BATCH, 1) for lesson in lessons)

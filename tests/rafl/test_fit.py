@@ -11,7 +11,14 @@ from rafl import fit
 from rafl.dataset import Dataset
 from rafl.errors import SimulationError
 from rafl.evaluation import compare
-from rafl.fit import fit_residual_field, mean_error, nothing_to_follow, training_items, validation_batches
+from rafl.fit import (
+    fit_residual_field,
+    mean_error,
+    nothing_to_follow,
+    shortened,
+    training_items,
+    validation_batches,
+)
 from rafl.global_residual import GlobalResidual
 from rafl.mesh import HexMesh
 from rafl.methods import check_inputs
@@ -19,6 +26,7 @@ from rafl.objective import Recordings
 from rafl.residual import ResidualField
 from rafl.run import FittedModel, Settings, load_model, load_tensors, save_model, save_tensors
 from rafl.supervised import fit_supervised
+from rafl.synthetic import with_material
 from rafl.sysid import _Search, identify_material, spoken
 from rafl.targets import residual_targets
 
@@ -144,6 +152,24 @@ def test_a_field_corrects_the_identified_material(dataset: Dataset, tmp_path: Pa
     assert mean_error(held_out, load_model(tmp_path / "b")) < 0.01 * mean_error(held_out, FittedModel("original"))
     again = fit_residual_field([dataset], replace(settings, start=str(tmp_path / "b")), tmp_path / "c", silent)
     assert again.material == identified.material
+
+
+def test_fine_tuning_follows_its_recordings_first(dataset: Dataset, tmp_path: Path) -> None:
+    """All their frames, whatever of them is simulated; training begins no worse than the field came."""
+    first = fit_residual_field([dataset], replace(SETTINGS, epochs=1, frames=6), tmp_path / "a", silent)
+    other = with_material(dataset.simulator, 300e3, 0.3)
+    changed = replace(dataset, simulator=other)
+    came = 1e3 * mean_error(validation_batches([shortened(changed, 6)]), first)
+    rows: list[dict[str, float]] = []
+    settings = replace(SETTINGS, epochs=1, frames=6, start=str(tmp_path / "a"), warm_start=3)
+    fit_residual_field([changed], settings, tmp_path / "b", rows.append)
+    assert [row["warm_start"] for row in rows[:3]] == [1, 2, 3]
+    assert rows[3]["epoch"] == 0
+    assert rows[3]["validation_mm"] == pytest.approx(min([came, *(row["validation_mm"] for row in rows[:3])]))
+    assert rows[3]["validation_mm"] < 0.9 * came
+    followed = torch.load(tmp_path / "b" / "targets-0.pt", weights_only=True)
+    steps = [len(dataset.trajectories[name].time) - 1 for name in dataset.split("train")]
+    assert len(followed["q"]) == sum(steps)
 
 
 def test_an_interrupted_identification_goes_on(

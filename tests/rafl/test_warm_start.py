@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from rafl import targets
+from rafl import warm_start as lesson
 from rafl.dataset import Dataset
 from rafl.fit import mean_error
 from rafl.material import Material
@@ -62,6 +63,40 @@ def test_the_lesson_needs_no_simulation_and_helps(seen: Dataset, tmp_path: Path)
         assert rows[-1]["missing"] < 0.5 * rows[0]["missing"]
         assert mean_error(validate, model) < 0.3 * mean_error(validate, FittedModel("original"))
         assert 1e3 * mean_error(validate, model) <= min(row["validation_mm"] for row in rows) + 1e-9
+
+
+def test_a_learned_field_goes_on_without_another_scale(seen: Dataset, tmp_path: Path) -> None:
+    """And is never worse than it came."""
+    torch.manual_seed(2)
+    field = ResidualField()
+    field.scale_to(torch.linspace(0.5, 2.0, 34, dtype=torch.float64))
+    scale = field.scale.clone()
+    model = FittedModel("rafl", field=field)
+    validate = [Recordings.of(seen, ["b"])]
+    before = mean_error(validate, model)
+    rows: list[dict[str, float]] = []
+    warm_start(field, [seen], tmp_path, 4, 0, lambda: 1e3 * mean_error(validate, model), rows.append, learned=True)
+    assert torch.equal(field.scale, scale)
+    assert len(rows) == 4
+    assert mean_error(validate, model) <= before
+
+
+def test_of_more_states_than_fit_some_are_drawn(seen: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The lesson still helps, and the compliance does not depend on how many columns are worked out at once."""
+    points = 8 * len(MESH.hexes)
+    monkeypatch.setattr(lesson, "MOST_POINTS", 20 * points)
+    monkeypatch.setattr(lesson, "TOGETHER", 7)
+    monkeypatch.setattr(lesson, "COLUMNS", 10)
+    small = lesson.Lesson(seen, tmp_path / "targets-0.pt")
+    assert small.states == 20
+    nodes = len(MESH.vertices)
+    whole = BASE.solve_tangent(MESH.vertices[None], np.eye(3 * nodes).reshape(1, nodes, 3, -1))[0]
+    np.testing.assert_allclose(small.compliance.numpy(), whole.reshape(3 * nodes, -1), rtol=1e-5, atol=1e-9)
+    np.testing.assert_allclose(small.size, small.inputs.double().square().mean((1, 2)).sqrt().numpy(), rtol=1e-5)
+    torch.manual_seed(2)
+    field, rows = ResidualField(), list[dict[str, float]]()
+    warm_start(field, [seen], tmp_path, 15, 0, lambda: 0.0, rows.append)
+    assert rows[-1]["missing"] < 0.8 * rows[0]["missing"]
 
 
 def test_the_forces_are_kept_for_an_interrupted_run(
