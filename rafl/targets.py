@@ -24,7 +24,7 @@ Array = NDArray[Any]
 
 PENALTY = 1e-4  # lambda_1 of the targets that are learned from [m^2/N^2]
 MOST_ITERATIONS = 12
-ENOUGH = 1e-8  # of the objective: a smaller gain ends the iteration
+ENOUGH = 1e-8  # gain, as a share of a step's objective, that ends the iteration
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,9 @@ class Targets:
     objective: Array
 
 
-def residual_targets(recordings: Recordings, penalty: float, tick: Callable[[], None] = lambda: None) -> Targets:
+def residual_targets(
+    recordings: Recordings, penalty: float, tick: Callable[[], None] = lambda: None, enough: float = ENOUGH
+) -> Targets:
     """Solve eq. 4 for every step in turn, by Gauss and Newton's method.
 
     The step's adjoint gives all of the markers' derivatives by the force at once; within a step they hardly change
@@ -53,6 +55,7 @@ def residual_targets(recordings: Recordings, penalty: float, tick: Callable[[], 
         recordings: of one dataset, whose simulator steps by plain backward differences.
         penalty: lambda_1 [m^2/N^2].
         tick: called after every step.
+        enough: gain, as a share of a step's objective, that ends its iteration.
 
     Raises:
         SimulationError: a step failed; names recordings and step.
@@ -71,7 +74,7 @@ def residual_targets(recordings: Recordings, penalty: float, tick: Callable[[], 
     force = np.zeros_like(q)
     parts: list[tuple[Array, Array, Array, Array]] = []
     for step in range(1, len(recordings.markers)):
-        problem = _Step(recordings, step, q, v, external, mass, penalty)
+        problem = _Step(recordings, step, q, v, external, mass, penalty, enough)
         after, force, objective = problem.solve(force)
         parts.append((q, v, force, objective))
         q, v = after, (after - q) / simulator.time_step
@@ -84,13 +87,16 @@ def can_be_followed(simulator: Simulator) -> bool:
     return simulator.integrator == "implicit-euler" and simulator.substeps == 1 and not simulator.parameters().damped
 
 
-def training_targets(dataset: Dataset, path: Path, most: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
+def training_targets(
+    dataset: Dataset, path: Path, most: int | None = None, enough: float = ENOUGH
+) -> tuple[Tensor, Tensor, Tensor]:
     """States q, v at the start of all training recordings' steps and the residual forces that follow, all (S, N, 3).
 
     Args:
         dataset: with training recordings.
         path: keeps them; where it exists it is read.
         most: how many markers, drawn at random but always the same, are followed; all unless given.
+        enough: as of `residual_targets`.
 
     Raises:
         SimulationError: the recordings cannot be followed.
@@ -102,7 +108,7 @@ def training_targets(dataset: Dataset, path: Path, most: int | None = None) -> t
             recordings = recordings.of_markers(np.sort(chosen))
         with progress() as bar:
             task = bar.add_task(f"{dataset.name}: residual forces", total=len(recordings.markers) - 1)
-            targets = residual_targets(recordings, PENALTY, lambda: bar.advance(task))
+            targets = residual_targets(recordings, PENALTY, lambda: bar.advance(task), enough)
         shown = recordings.valid[1:].amax(-1).bool()
         content = {key: torch.from_numpy(getattr(targets, key))[shown] for key in ("q", "v", "force")}
         save_tensors(path, {"format": FORMAT, "method": "residual forces", **content})
@@ -122,6 +128,7 @@ class _Step:
     external: Array
     mass: Array
     penalty: float
+    enough: float
 
     @property
     def simulator(self) -> Simulator:
@@ -150,7 +157,7 @@ class _Step:
             keep = better[:, None, None]
             force, x = np.where(keep, trial, force), np.where(keep, moved, x)
             gap[better], objective[better] = new_gap[better], new_objective[better]
-            if gain < ENOUGH:
+            if gain < self.enough:
                 break
         return x, force, objective
 

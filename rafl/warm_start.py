@@ -7,6 +7,7 @@ to them does not damp.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +27,9 @@ RATE = 3e-3  # Adam's, at the start of the cosine decay
 DECAY = 0.3  # of the weights, a unit of rate: without it the field is wilder on shapes it has not seen
 BATCH = 16  # states an update
 MARKERS = 48  # that are followed at most: more tell hardly more
+ENOUGH = 0.1  # gain that ends a step's iteration: a lesson from forces to 1e-8 is no better
 LARGEST = 4000  # vertices: beyond, the body's compliance does not fit as a full matrix
-MOST_POINTS = 8_000_000  # quadrature points of a dataset's states, 172 bytes each; of more states some are drawn
+MOST_POINTS = 12_000_000  # quadrature points of a dataset's states, 172 bytes each: fewer recordings are followed
 TOGETHER = 32  # states whose features are worked out at once
 COLUMNS = 512  # of the compliance, likewise
 
@@ -37,13 +39,15 @@ class Lesson:
 
     def __init__(self, dataset: Dataset, targets: Path) -> None:
         simulator = dataset.simulator
-        q, v, missing = (part.numpy() for part in training_targets(dataset, targets, MARKERS))
-        nodes = q.shape[1]
         points = FieldPoints.of(simulator)
         each = 8 * len(points.hexes)
-        if len(q) * each > MOST_POINTS:
-            drawn = np.sort(np.random.default_rng(0).choice(len(q), max(MOST_POINTS // each, BATCH), replace=False))
+        most = max(MOST_POINTS // each, BATCH)
+        chosen = _as_many_as_fit(dataset, most)
+        q, v, missing = (part.numpy() for part in training_targets(chosen, targets, MARKERS, ENOUGH))
+        if len(q) > most:
+            drawn = np.sort(np.random.default_rng(0).choice(len(q), most, replace=False))
             q, v, missing = q[drawn], v[drawn], missing[drawn]
+        nodes = q.shape[1]
         self.states = states = len(q)
         self.inputs = torch.empty(FEATURES, states, each)
         self.turn = torch.empty(states, each, 3, 3)
@@ -75,6 +79,15 @@ class Lesson:
         pull = (self.turn[chosen] @ acceleration[..., None])[..., 0]
         force = torch.einsum("pn,bpi->bni", self.shares, pull).flatten(1)
         return self._work(force - self.force[chosen]) / self.work
+
+
+def _as_many_as_fit(dataset: Dataset, states: int) -> Dataset:
+    """The training recordings, evenly left out where they have more states than that; one at least."""
+    names = dataset.split("train")
+    longest = max(len(dataset.trajectories[name].time) for name in names)
+    count = min(max(states // longest, 1), len(names))
+    kept = [names[k] for k in np.unique(np.linspace(0, len(names) - 1, count).round().astype(int))]
+    return replace(dataset, trajectories={name: dataset.trajectories[name] for name in kept})
 
 
 def _compliance(simulator: Simulator) -> Tensor:

@@ -81,22 +81,33 @@ def test_a_learned_field_goes_on_without_another_scale(seen: Dataset, tmp_path: 
     assert mean_error(validate, model) <= before
 
 
-def test_of_more_states_than_fit_some_are_drawn(seen: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The lesson still helps, and the compliance does not depend on how many columns are worked out at once."""
-    points = 8 * len(MESH.hexes)
-    monkeypatch.setattr(lesson, "MOST_POINTS", 20 * points)
-    monkeypatch.setattr(lesson, "TOGETHER", 7)
-    monkeypatch.setattr(lesson, "COLUMNS", 10)
+@pytest.mark.parametrize(("room", "states"), [(40, 38), (30, 19), (17, 17), (1, 16)])
+def test_what_does_not_fit_in_memory_is_left_out(
+    seen: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, room: int, states: int
+) -> None:
+    """Recordings of 19 steps first, then steps, never below a batch; the lesson still helps."""
+    monkeypatch.setattr(lesson, "MOST_POINTS", room * 8 * len(MESH.hexes))
     small = lesson.Lesson(seen, tmp_path / "targets-0.pt")
-    assert small.states == 20
-    nodes = len(MESH.vertices)
-    whole = BASE.solve_tangent(MESH.vertices[None], np.eye(3 * nodes).reshape(1, nodes, 3, -1))[0]
-    np.testing.assert_allclose(small.compliance.numpy(), whole.reshape(3 * nodes, -1), rtol=1e-5, atol=1e-9)
+    assert small.states == states
     np.testing.assert_allclose(small.size, small.inputs.double().square().mean((1, 2)).sqrt().numpy(), rtol=1e-5)
     torch.manual_seed(2)
     field, rows = ResidualField(), list[dict[str, float]]()
     warm_start(field, [seen], tmp_path, 15, 0, lambda: 0.0, rows.append)
     assert rows[-1]["missing"] < 0.8 * rows[0]["missing"]
+
+
+def test_the_compliance_is_of_all_columns(seen: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many of them, and of the states, are worked out at once."""
+    nodes = len(MESH.vertices)
+    whole = BASE.solve_tangent(MESH.vertices[None], np.eye(3 * nodes).reshape(1, nodes, 3, -1))[0]
+    once = lesson.Lesson(seen, tmp_path / "targets-0.pt")
+    monkeypatch.setattr(lesson, "TOGETHER", 7)
+    monkeypatch.setattr(lesson, "COLUMNS", 10)
+    apart = lesson.Lesson(seen, tmp_path / "targets-0.pt")
+    for each in (once, apart):
+        np.testing.assert_allclose(each.compliance.numpy(), whole.reshape(3 * nodes, -1), rtol=1e-5, atol=1e-9)
+    assert torch.equal(once.inputs, apart.inputs)
+    assert torch.equal(once.turn, apart.turn)
 
 
 def test_the_forces_are_kept_for_an_interrupted_run(
