@@ -198,8 +198,9 @@ class Study:
         tables = []
         for trained in self.shapes:
             path = self.out / shape / "tested" / f"{trained}.csv"
-            table = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=["method"])
-            missing = [name for name in self.models(trained) if f"{name}@{trained}" not in set(table["method"])]
+            parts = [pd.read_csv(path)] if path.exists() else []
+            known = {name for part in parts for name in part["method"]}
+            missing = [name for name in self.models(trained) if f"{name}@{trained}" not in known]
             if missing:
                 print(f"{shape}: testing what was trained on {trained}", flush=True)
                 dataset = read_dataset(self.out / shape / f"{shape}.h5")
@@ -210,9 +211,9 @@ class Study:
                     if model.network is None or model.network.nodes == nodes:
                         models[f"{name}@{trained}"] = model
                 if models:
-                    table = pd.concat([table, test_errors(replace(dataset, trajectories=unseen), models)])
-                    write_text(path, table.drop_duplicates("method").to_csv(index=False))
-            tables.append(table)
+                    parts.append(test_errors(replace(dataset, trajectories=unseen), models))
+                    write_text(path, pd.concat(parts).drop_duplicates("method").to_csv(index=False))
+            tables += parts
         return pd.concat(tables).drop_duplicates("method")
 
 
