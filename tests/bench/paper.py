@@ -41,7 +41,8 @@ from rafl.targets import PENALTY, residual_targets
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
 SPECIMENS = EXPERIMENTS.parent / "specimens"
 LARGE = 1000  # vertices: fine-tuned for fewer epochs of fewer frames at another rate; left out by --quick
-LARGE_FRAMES, LARGE_RATE = 50, 8e-3
+LARGE_FRAMES, LARGE_RATE = 50, 4e-3
+FIRST_PASSES = 10  # of a fine-tuning's warm start
 BEAMS = ("canonical", "longer", "shorter", "thicker", "thinner")
 COLUMNS = ["shape", "method", "mean_mm", "std_mm", "paper_mean_mm", "paper_std_mm"]
 
@@ -184,8 +185,10 @@ class Study:
             if not epochs:
                 continue
             own = [self.dataset(shape, "train", "val")]
-            how = {"frames": LARGE_FRAMES, "learning_rate": LARGE_RATE} if large else {}
-            tuned = self.fit(f"fine-{shape}", "rafl", own, epochs=epochs, start=start, force_penalty=0.0, **how)
+            how: dict[str, Any] = {"start": start, "warm_start": FIRST_PASSES, "force_penalty": 0.0}
+            if large:
+                how |= {"frames": LARGE_FRAMES, "learning_rate": LARGE_RATE}
+            tuned = self.fit(f"fine-{shape}", "rafl", own, epochs=epochs, **how)
             found = self.errors(shape, {"rafl-fine-tuned": tuned})
             rows += [{**row, "shape": f"{shape}"} for row in found if row["method"] == "rafl-fine-tuned"]
         return pd.DataFrame(rows, columns=COLUMNS)
