@@ -1,13 +1,15 @@
 """Specimens, datasets and recordings that several tests start from."""
 
 import contextlib
+import multiprocessing
 import subprocess
-import sys
+import tempfile
+from multiprocessing.reduction import DupFd
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support import Run
+from support import Run, enter_command
 
 from capture.specimen import Specimen, read_specimen
 
@@ -24,6 +26,10 @@ def _forget_stale_kernels() -> None:
 
 
 _forget_stale_kernels()
+
+# Imports what commands need once; each of them is a fork of that.
+COMMANDS = multiprocessing.get_context("forkserver")
+COMMANDS.set_forkserver_preload(["support", "capture.cli", "rafl.cli", "tracking.cli"])
 
 SMALL = """format: rafl-specimen/1
 name: small
@@ -60,12 +66,20 @@ def small_specimen(tmp_path_factory: pytest.TempPathFactory) -> Specimen:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
-    """Run a console script in a temporary folder, as a stranger would."""
+    """Run a command in a temporary folder and a process of its own, as a stranger would, imports made before."""
 
     def command(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-        script = Path(sys.executable).parent / name
-        line = [str(script), *map(str, arguments)]
-        return subprocess.run(line, cwd=tmp_path, capture_output=True, text=True, check=False, timeout=600)
+        line = [name, *map(str, arguments)]
+        with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
+            child = COMMANDS.Process(
+                target=enter_command, args=(line, tmp_path, DupFd(out.fileno()), DupFd(err.fileno()))
+            )
+            child.start()
+            child.join(600)
+            assert child.exitcode is not None, f"{line} did not end"
+            out.seek(0)
+            err.seek(0)
+            return subprocess.CompletedProcess(line, child.exitcode, out.read(), err.read())
 
     return command
 

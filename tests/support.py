@@ -2,8 +2,11 @@
 
 import os
 import subprocess
+import sys
 from collections.abc import Callable
+from importlib.metadata import entry_points
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,6 +15,16 @@ ROOT = Path(__file__).parent.parent
 SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared")).resolve()
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
+
+
+def enter_command(line: list[str], folder: Path, out: Any, err: Any) -> None:
+    """Be a console script: its name and arguments, working folder, standard output and error."""
+    os.chdir(folder)
+    for number, handle in ((1, out), (2, err)):
+        os.dup2(handle.detach(), number)
+    sys.argv = line
+    (script,) = entry_points(group="console_scripts", name=line[0])
+    sys.exit(script.load()())
 
 
 def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> None:
