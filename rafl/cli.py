@@ -30,6 +30,7 @@ from rafl.processes import process_count, rank
 from rafl.report import write_report
 from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
 from rafl.sysid import spoken
+from rafl.warm_start import LARGEST
 
 # The network is small; the other core serves the element kernels.
 TORCH_THREADS = 1
@@ -109,7 +110,10 @@ def fit(
         if process_count() > batch:
             typer.echo(f"{process_count()} processes share out {batch}: give --batch to use them all", err=True)
         if method == "rafl" and nothing_to_follow(loaded, settings):
-            typer.echo("no warm start: it needs implicit-euler, one substep and no viscosity", err=True)
+            typer.echo(
+                f"no warm start: it needs implicit-euler, one substep, no viscosity and at most {LARGEST} vertices",
+                err=True,
+            )
     writer = open_writer(run) if open_writer and first else None
     with progress() as bar:
         task = bar.add_task("epoch", total=epochs)

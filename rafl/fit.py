@@ -29,8 +29,7 @@ from rafl.run import (
     understood,
     write_history,
 )
-from rafl.targets import can_be_followed
-from rafl.warm_start import warm_start
+from rafl.warm_start import can_teach, warm_start
 
 GRADIENT_LIMIT = 10.0  # Adam's step does not depend on the size; a diverging rollout's must not enter its memory
 
@@ -54,12 +53,13 @@ def shortened(dataset: Dataset, frames: int) -> Dataset:
 
 def prepared(datasets: list[Dataset], settings: Settings) -> list[Dataset]:
     """The datasets with the frames and the integrator to train with."""
-    result = [shortened(dataset, settings.frames) for dataset in datasets]
+    return [_stepped(shortened(dataset, settings.frames), settings) for dataset in datasets]
+
+
+def _stepped(dataset: Dataset, settings: Settings) -> Dataset:
     if not settings.integrator:
-        return result
-    return [
-        replace(dataset, simulator=replace(dataset.simulator, integrator=settings.integrator)) for dataset in result
-    ]
+        return dataset
+    return replace(dataset, simulator=replace(dataset.simulator, integrator=settings.integrator))
 
 
 @dataclass(frozen=True)
@@ -130,21 +130,21 @@ def model_to_go_on_from(run: Path) -> FittedModel:
 
 
 def _trained_on(datasets: list[Dataset], settings: Settings) -> tuple[FittedModel, list[Dataset]]:
-    """What training goes on from, and the datasets as it uses them: with what that run identified, stepping as it did
-    unless an integrator is asked for."""
+    """What training goes on from, and the datasets, all frames, as it uses them: with what that run identified,
+    stepping as it did unless an integrator is asked for."""
     start = model_to_go_on_from(Path(settings.start)) if settings.start else FittedModel("rafl")
     values: dict[str, Any] = dict(start.material or {})
     used = []
-    for dataset in prepared(datasets, settings):
+    for dataset in (_stepped(item, settings) for item in datasets):
         simulator = dataset.simulator if settings.integrator else start.simulator(dataset.simulator)
         used.append(replace(dataset, simulator=replace(simulator, material=replace(simulator.material, **values))))
     return start, used
 
 
 def nothing_to_follow(datasets: list[Dataset], settings: Settings) -> bool:
-    """Whether a warm start is wanted that no dataset's simulator, as it will be trained with, can give."""
+    """Whether a warm start is wanted that no dataset, as it will be trained with, can give."""
     _, used = _trained_on(datasets, settings)
-    return settings.warm_start > 0 and not any(can_be_followed(dataset.simulator) for dataset in used)
+    return settings.warm_start > 0 and not any(can_teach(dataset) for dataset in used)
 
 
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
@@ -179,8 +179,8 @@ class _Training:
     ) -> None:
         self.settings, self.run, self.group = settings, run, group
         self.report: Report = report if group.first else lambda row: None
-        whole = datasets
-        start, datasets = _trained_on(whole, settings)
+        start, whole = _trained_on(datasets, settings)
+        datasets = [shortened(dataset, settings.frames) for dataset in whole]
         self.items, self.validate = training_items(datasets), validation_batches(datasets)
         self.history: list[dict[str, float]] = []
         torch.manual_seed(settings.seed)
@@ -190,7 +190,7 @@ class _Training:
             if start.field is None:
                 self._prepare(datasets)
             warm_start(
-                self.field, _trained_on(whole, replace(settings, frames=0))[1], run, settings.warm_start, settings.seed,
+                self.field, whole, run, settings.warm_start, settings.seed,
                 lambda: 1e3 * mean_error(self.validate, self.model), self.report, learned=start.field is not None,
             )  # fmt: skip
         self.optimiser = torch.optim.Adam(

@@ -84,8 +84,8 @@ class Lesson:
 def _as_many_as_fit(dataset: Dataset, states: int) -> Dataset:
     """The training recordings, evenly left out where they have more states than that; one at least."""
     names = dataset.split("train")
-    longest = max(len(dataset.trajectories[name].time) for name in names)
-    count = min(max(states // longest, 1), len(names))
+    steps = max(len(dataset.trajectories[name].time) - 1 for name in names)
+    count = min(max(states // max(steps, 1), 1), len(names))
     kept = [names[k] for k in np.unique(np.linspace(0, len(names) - 1, count).round().astype(int))]
     return replace(dataset, trajectories={name: dataset.trajectories[name] for name in kept})
 
@@ -100,6 +100,12 @@ def _compliance(simulator: Simulator) -> Tensor:
     return compliance
 
 
+def can_teach(dataset: Dataset) -> bool:
+    """Whether a warm start learns from it: training recordings that can be followed, on a mesh not too large."""
+    small = len(dataset.simulator.mesh.vertices) <= LARGEST
+    return small and bool(dataset.split("train")) and can_be_followed(dataset.simulator)
+
+
 def warm_start(
     field: ResidualField,
     datasets: list[Dataset],
@@ -112,9 +118,8 @@ def warm_start(
 ) -> None:
     """Fit a field, in place, to the forces that the training recordings call for.
 
-    Datasets that are large, or whose simulator damps by viscosity or steps otherwise than
-    by backward differences, teach nothing here. What fits the recorded states best need not be stable beside them: of
-    all epochs the one is kept that simulates best.
+    Of datasets only those count that can teach. What fits the recorded states best need not be stable beside them:
+    of all epochs the one is kept that simulates best.
 
     Args:
         field: to be trained.
@@ -132,8 +137,8 @@ def warm_start(
     try:
         lessons = [
             Lesson(dataset, run / f"targets-{number}.pt")
-            for number, dataset in enumerate(item for item in datasets if item.split("train"))
-            if can_be_followed(dataset.simulator) and len(dataset.simulator.mesh.vertices) <= LARGEST
+            for number, dataset in enumerate(datasets)
+            if can_teach(dataset)
         ]
     except SimulationError as error:
         raise SimulationError(f"{error}; train without following the recordings first: --warm-start 0") from None

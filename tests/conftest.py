@@ -76,7 +76,9 @@ def run(tmp_path: Path) -> Run:
             )
             child.start()
             child.join(600)
-            assert child.exitcode is not None, f"{line} did not end"
+            if child.exitcode is None:
+                child.kill()
+                pytest.fail(f"{line} did not end")
             out.seek(0)
             err.seek(0)
             return subprocess.CompletedProcess(line, child.exitcode, out.read(), err.read())
