@@ -18,7 +18,7 @@ from tracking.family import Family, find_family
 from tracking.frame import Frame
 from tracking.motion import Motion
 from tracking.newcomers import Newcomer, Newcomers
-from tracking.noise import with_coding_errors, with_shared_errors
+from tracking.noise import places_and_errors
 from tracking.shape import Pattern, carry, recognise
 from tracking.video import Video
 
@@ -104,8 +104,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
         )
     with ThreadPoolExecutor(1) as aside:
         pictures = aside.submit(album.pictures)
-        paths, fitted, leverage, step = _whole(seen, late, len(tracker.pattern.rest))
-        sigma = with_coding_errors(paths, with_shared_errors(paths, fitted), leverage, step)
+        paths, sigma = places_and_errors(*_whole(seen, late, len(tracker.pattern.rest)))
     return PixelTracks(
         np.array(times), paths, sigma, tracker.pattern.rest, len(late), np.array(damaged),
         pictures.result(), tuple(reading.notes),

@@ -1,9 +1,10 @@
-"""How well dots were really located: what one picture cannot tell about itself.
+"""How well dots were really located, which one picture cannot tell, and what the other dots' motion can mend.
 
 Compression moves whole dots a little, most where the picture changes slowly, and leaves no trace in
 the fit. But markers ride on one body: what a marker's path has that the others' do not is error.
 """
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -15,62 +16,43 @@ Array = NDArray[Any]
 # which the marker keeps still, and along its way, where the encoder lets it lag. Measured on libx264, crf 18 to 28,
 # dots of 8 px; its quickest presets lag twice as far.
 STILL, LAGGING = 0.45, 1.0
+# The share of these errors' variance that all markers have in common: of markers that move far from frame to frame,
+# and how much more where they move less than SLOW of these errors a frame and wait together until the encoder takes
+# notice. Measured likewise; at the quickest presets most of it is common.
+COMMON, WAITING, SLOW = 0.03, 0.6, 4.0
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
 MODES = 12  # of the body's motion, at most
-MANY = 1500  # frames, evenly chosen, are enough
 TELLING = 0.3  # of a fit's variance: an excess smaller than this may be chance
+SURPRISING = 3.0  # standard deviations: farther from where the others put it, a marker moves on its own
 
 
-def with_shared_errors(pixel: Array, sigma: Array) -> Array:
-    """Standard deviations (T, D, 2) that also hold what a marker's path has beyond its fits' errors.
+def places_and_errors(pixel: Array, fitted: Array, leverage: Array, step: Array) -> tuple[Array, Array]:
+    """The markers' places and standard deviations [px], (T, D, 2) each, after all frames have been seen.
 
-    Each marker is predicted from the modes in which the others move. Left as they are where too few
-    frames or markers tell.
-
-    Args:
-        pixel: paths [px], (T, D, 2), NaN where not seen.
-        sigma: from the fits [px], (T, D, 2).
-    """
-    seen = np.isfinite(sigma[..., 0])
-    markers = np.flatnonzero(seen.mean(axis=0) > 0.8)
-    frames = np.flatnonzero(seen[:, markers].all(axis=1)) if len(markers) else np.zeros(0, int)
-    if len(frames) < FEWEST_FRAMES or len(markers) < FEWEST_MARKERS:
-        return sigma
-    frames = frames[:: max(len(frames) // MANY, 1)]
-    path = pixel[np.ix_(frames, markers)]
-    path = path - path.mean(axis=0)
-    count = min(MODES, len(frames) // 4, len(markers) // 2)
-    excess = np.zeros((len(markers), 2))
-    for k in range(len(markers)):
-        others = np.delete(path, k, axis=1).reshape(len(frames), -1)
-        square, modes = np.linalg.eigh(others.T @ others)  # ascending
-        size = np.sqrt(np.maximum(square[-count:], 1e-12 * square[-1]))
-        basis = others @ modes[:, -count:] / size
-        gain = basis.T @ path[:, k]
-        missed = ((path[:, k] - basis @ gain) ** 2).sum(axis=0) / (len(frames) - count)
-        # The modes carry the others' errors too.
-        carried = 1.0 + (gain**2 / size[:, None] ** 2).sum(axis=0)
-        own = (sigma[np.ix_(frames, markers[k : k + 1])][:, 0] ** 2).mean(axis=0)
-        beyond = missed / carried - own
-        excess[k] = np.where(beyond > TELLING * own, beyond, 0.0)
-    added = np.zeros((sigma.shape[1], 2))
-    added[:] = np.median(excess, axis=0)
-    added[markers] = excess
-    return np.sqrt(sigma**2 + added)
-
-
-def with_coding_errors(pixel: Array, sigma: Array, leverage: Array, step: Array) -> Array:
-    """Standard deviations (T, D, 2) no smaller than what the coding of the pictures leads one to expect.
-
-    An encoder passes over changes below its step: a dot that moves a little stays where it was, and the picture it
-    leaves is clean, so that the fit does not show it.
+    Places change only where the pictures were coded with known steps: there a marker is drawn towards where the
+    others' motion puts it, by as much as the coding's errors and the body's own irregular motion call for.
 
     Args:
-        pixel: paths [px], (T, D, 2), NaN where not seen.
-        sigma: so far [px], (T, D, 2).
+        pixel: paths as fitted [px], (T, D, 2), NaN where not seen.
+        fitted: standard deviations from the fits [px], (T, D, 2).
         leverage: what a grey level of independent noise in every pixel moves a centre by [px], (T, D, 2), NaN where
             not known.
         step: by which the picture was rounded there [grey levels], (T, D), NaN where not known: as in other frames.
+    """
+    coding = coding_errors(pixel, leverage, step)
+    expected = np.maximum(fitted, coding)
+    others = Others.of(pixel, expected)
+    if others is None:
+        return pixel, expected
+    off, gone = mendable(pixel, fitted, coding, others)
+    return pixel - off, np.sqrt(with_shared_errors(expected, others) ** 2 - gone)
+
+
+def coding_errors(pixel: Array, leverage: Array, step: Array) -> Array:
+    """Standard deviations (T, D, 2) that the coding of the pictures leads one to expect [px]; 0 where nothing is known.
+
+    An encoder passes over changes below its step: a dot that moves a little stays where it was, and the picture it
+    leaves is clean, so that the fit does not show it. Arguments as for `places_and_errors`.
     """
     told = np.isfinite(step)
     square = np.nansum(step**2, axis=0) / np.maximum(told.sum(axis=0), 1)
@@ -80,4 +62,100 @@ def with_coding_errors(pixel: Array, sigma: Array, leverage: Array, step: Array)
     mean = np.nansum(pixel, axis=0) / count
     spread = np.nansum((pixel - mean) ** 2, axis=0) / count
     moves = spread > 4.0 * (still**2).sum(axis=0) / count
-    return np.maximum(sigma, np.where(moves, LAGGING / STILL, 1.0) * still)
+    return np.where(moves, LAGGING / STILL, 1.0) * still
+
+
+@dataclass(frozen=True)
+class Others:
+    """Where the modes in which the other markers move put each marker, itself left out.
+
+    Attributes:
+        frames: in which all of these markers are seen, (F).
+        markers: seen in most frames, (M).
+        away: of the measured places from there [px], (F, M, 2).
+        leverage: share of a place in its own prediction, left out of `away`, (F, M).
+        carried: variance of the predictions by the others' errors, beside that of a place, (M, 2).
+    """
+
+    frames: NDArray[np.int64]
+    markers: NDArray[np.int64]
+    away: Array
+    leverage: Array
+    carried: Array
+
+    @classmethod
+    def of(cls, pixel: Array, sigma: Array) -> "Others | None":
+        """Of paths and their standard deviations [px], (T, D, 2); None where too few frames or markers tell."""
+        seen = np.isfinite(sigma[..., 0])
+        markers = np.flatnonzero(seen.mean(axis=0) > 0.8)
+        frames = np.flatnonzero(seen[:, markers].all(axis=1)) if len(markers) else np.zeros(0, int)
+        if len(frames) < FEWEST_FRAMES or len(markers) < FEWEST_MARKERS:
+            return None
+        path = pixel[np.ix_(frames, markers)]
+        path = (path - path.mean(axis=0)).reshape(len(frames), -1)
+        product = path.T @ path
+        noise = (sigma[np.ix_(frames, markers)] ** 2).mean(axis=(0, 2))
+        most = min(MODES, len(frames) // 4, len(markers) // 2)
+        away = np.empty((len(frames), len(markers), 2))
+        leverage, carried = np.empty(away.shape[:2]), np.empty((len(markers), 2))
+        for k in range(len(markers)):
+            own = np.array([2 * k, 2 * k + 1])
+            other = np.delete(np.arange(path.shape[1]), own)
+            square, modes = np.linalg.eigh(product[np.ix_(other, other)])  # ascending
+            # Up to this size independent errors make modes of their own.
+            by_chance = np.delete(noise, k).mean() * (np.sqrt(len(frames)) + np.sqrt(len(other))) ** 2
+            count = max(min(most, int((square > by_chance).sum())), 1)
+            size = np.sqrt(np.maximum(square[-count:], 1e-12 * max(square[-1], 1e-12)))
+            basis = np.zeros((path.shape[1], count))
+            basis[other] = modes[:, -count:] / size
+            amount = path @ basis
+            gain = amount.T @ path[:, own]
+            leverage[:, k] = np.minimum((amount**2).sum(axis=1) + 1.0 / len(frames), 1.0 - 1e-9)
+            away[:, k] = (path[:, own] - amount @ gain) / (1.0 - leverage[:, k, None])
+            carried[k] = (gain**2 / size[:, None] ** 2).sum(axis=0)
+        return cls(frames, markers, away, leverage, carried)
+
+    @property
+    def missed(self) -> Array:
+        """Mean square of what the others' motion leaves of each path, as if it had not been fitted [px^2], (M, 2)."""
+        return (self.away**2 * (1.0 - self.leverage[..., None])).mean(axis=0)
+
+
+def with_shared_errors(sigma: Array, others: Others) -> Array:
+    """Standard deviations (T, D, 2) that also hold what a marker's path has beyond the errors `sigma` so far [px]."""
+    own = (sigma[np.ix_(others.frames, others.markers)] ** 2).mean(axis=0)
+    beyond = others.missed / (1.0 + others.carried) - own
+    excess = np.where(beyond > TELLING * own, beyond, 0.0)
+    added = np.zeros((sigma.shape[1], 2))
+    added[:] = np.median(excess, axis=0)
+    added[others.markers] = excess
+    return np.sqrt(sigma**2 + added)
+
+
+def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tuple[Array, Array]:
+    """What of the places is coding's error, by the others' motion [px], and the variances that go with it, (T, D, 2).
+
+    The best mean of two places of known variances, the measured one and the others'. Zero where nothing is known of
+    the coding. What all markers have in common cannot be seen, and stays.
+
+    Args:
+        pixel: paths as fitted [px], (T, D, 2).
+        fitted: standard deviations from the fits [px], (T, D, 2).
+        coding: those by coding [px], (T, D, 2).
+        others: motion of these paths.
+    """
+    where = np.ix_(others.frames, others.markers)
+    square, shown = coding[where] ** 2, fitted[where] ** 2
+    whole = np.maximum(square, shown)
+    usual = np.maximum(square.mean(axis=0), 1e-12)
+    moves = np.maximum(np.nanmean(np.diff(pixel, axis=0) ** 2, axis=0)[others.markers] - usual, 0.0)
+    common = COMMON + WAITING / (1.0 + moves / (SLOW**2 * usual))
+    own = np.where(square > 0.0, whole - common * (whole - shown), 0.0)
+    # What the others do not tell of the body's motion, and what their errors and its own make of their prediction.
+    share = (others.leverage / (1.0 - others.leverage))[..., None]
+    least = (others.carried + share) * whole.mean(axis=0)
+    irregular = np.maximum(others.missed - own.mean(axis=0), least)
+    part = own / np.maximum(own + irregular, (others.away / SURPRISING) ** 2)
+    off, gone = np.zeros((2, *pixel.shape))
+    off[where], gone[where] = part * others.away, part * own
+    return off, gone

@@ -6,7 +6,7 @@ import pytest
 from support import picture
 
 from tracking.follow import follow
-from tracking.noise import with_shared_errors
+from tracking.noise import Others, places_and_errors, with_shared_errors
 from tracking.video import open_video
 
 
@@ -18,25 +18,76 @@ def paths(random: np.random.Generator, noise: np.ndarray) -> np.ndarray:
     return np.einsum("kt,kdi->tdi", amounts, modes) + random.normal(size=(200, 20, 2)) * noise[:, None]
 
 
+def with_others(pixel: np.ndarray, sigma: np.ndarray) -> np.ndarray:
+    others = Others.of(pixel, sigma)
+    assert others is not None
+    return with_shared_errors(sigma, others)
+
+
+def coded(pixel: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places and standard deviations of paths whose coding leads one to expect that error, if they move."""
+    leverage, step = np.full(pixel.shape, 0.01), np.full(pixel.shape[:2], error / 0.01)
+    return places_and_errors(pixel, np.where(np.isnan(pixel), np.nan, 0.01), leverage, step)
+
+
 def test_honest_fits_are_left_alone(random: np.random.Generator) -> None:
     pixel = paths(random, np.full(20, 0.02))
     sigma = np.full(pixel.shape, 0.02)
-    assert np.mean(with_shared_errors(pixel, sigma) / sigma) == pytest.approx(1.0, abs=0.05)
+    assert np.mean(with_others(pixel, sigma) / sigma) == pytest.approx(1.0, abs=0.05)
 
 
 def test_errors_no_picture_shows_are_found(random: np.random.Generator) -> None:
     """Half of the markers are really off by 0.06 px, where their fits say 0.02."""
     noise = np.where(np.arange(20) < 10, 0.02, 0.06)
     sigma = np.full((200, 20, 2), 0.02)
-    found = with_shared_errors(paths(random, noise), sigma)
+    found = with_others(paths(random, noise), sigma)
     for group in (slice(0, 10), slice(10, 20)):
         assert found[0, group].mean() == pytest.approx(noise[group].mean(), rel=0.2)
 
 
+@pytest.mark.parametrize("error", [0.03, 0.08])
+def test_the_others_mend_what_coding_moved(random: np.random.Generator, error: float) -> None:
+    state = random.bit_generator.state
+    pixel = paths(random, np.full(20, error))
+    random.bit_generator.state = state
+    truth = paths(random, np.zeros(20))
+    place, sigma = coded(pixel, error)
+    off = np.sqrt(np.mean((place - truth) ** 2))
+    assert off < 0.5 * error
+    assert np.sqrt(np.mean(sigma**2)) == pytest.approx(off, rel=0.35)
+
+
+def test_a_marker_that_moves_on_its_own_stays_where_it_was_seen(random: np.random.Generator) -> None:
+    """One that trembles all the time, by ten times the error expected, and one that is jerked once."""
+    pixel = paths(random, np.full(20, 0.05))
+    pixel[:, 3, 0] += 0.5 * np.sin(2.3 * np.arange(200))
+    pixel[77, 8, 1] += 1.0
+    place, _ = coded(pixel, 0.05)
+    assert np.sqrt(np.mean((place - pixel)[:, 3, 0] ** 2)) < 0.01
+    assert abs((place - pixel)[77, 8, 1]) < 0.05
+
+
+def test_places_stay_where_nothing_is_known_of_the_coding(random: np.random.Generator) -> None:
+    pixel = paths(random, np.full(20, 0.05))
+    pixel[50:60, 4] = np.nan
+    sigma = np.where(np.isnan(pixel), np.nan, 0.05)
+    place, _ = places_and_errors(pixel, sigma, np.full(pixel.shape, 0.01), np.full(pixel.shape[:2], np.nan))
+    np.testing.assert_array_equal(place, pixel)
+
+
+def test_frames_in_which_some_are_hidden_keep_their_places(random: np.random.Generator) -> None:
+    pixel = paths(random, np.full(20, 0.05))
+    pixel[50:60, 4] = np.nan
+    place, sigma = coded(pixel, 0.05)
+    np.testing.assert_array_equal(place[50:60], pixel[50:60])
+    assert not (place[:50] == pixel[:50]).any()
+    assert (sigma[50:60, 5] > sigma[60, 5]).all()
+
+
 def test_few_frames_say_nothing(random: np.random.Generator) -> None:
     pixel = paths(random, np.full(20, 0.1))[:20]
-    sigma = np.full(pixel.shape, 0.02)
-    np.testing.assert_array_equal(with_shared_errors(pixel, sigma), sigma)
+    assert Others.of(pixel, np.full(pixel.shape, 0.02)) is None
+    np.testing.assert_array_equal(coded(pixel, 0.1)[0], pixel)
 
 
 @pytest.mark.parametrize(("crf", "swing"), [("4", 2.0), ("23", 2.0), ("23", 20.0), ("28", 2.0)])
