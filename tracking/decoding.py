@@ -3,9 +3,12 @@
 import gc
 import heapq
 import logging
+import os
+import queue
 from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -32,6 +35,7 @@ STEPS = 0.625 * 2.0 ** (np.arange(-64, 128) / 6.0)  # by quantiser, from -64
 # Decoders that refuse what is damaged, and need not be heard: this one writes dozens of lines a frame into its log, for
 # each of which PyAV waits for Python's lock, though nobody is to see them.
 OPEN = {"mjpeg"}
+MOST_DECODERS = 4  # side by side, of videos each of whose pictures stands for itself
 _heard: list[str] = []  # the decoders at work that must be heard; the log is one for the whole program
 DEEPEST = 32  # frames that may be shown before one that they refer to: H.264 and HEVC allow 16
 
@@ -39,7 +43,7 @@ DEEPEST = 32  # frames that may be shown before one that they refer to: H.264 an
 def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Iterator[Frame]:
     """Every frame of a video file in order; damaged ones, and those that refer to them, without a picture.
 
-    Decodes in one thread, which is what makes a decoder own up to damage.
+    Each decoder works in one thread, which is what makes it own up to damage.
 
     Args:
         path: of the file.
@@ -52,11 +56,16 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
     """
     shown: list[float] = []
     try:
-        with av.open(str(path)) as container:
-            with _log_of(container.streams.video[0].codec_context.name):
-                for frame in _frames(container, notes):
-                    shown.append(frame.time)
-                    yield frame
+        with ExitStack() as stack:
+            container = stack.enter_context(av.open(str(path)))
+            codec = container.streams.video[0].codec_context.codec
+            stack.enter_context(_log_of(codec.name))
+            count = min(MOST_DECODERS, os.cpu_count() or 1) if codec.intra_only else 1
+            containers = [container, *(stack.enter_context(av.open(str(path))) for _ in range(1, count))]
+            decoders = [_strict(item.streams.video[0]) for item in containers]
+            for frame in stack.enter_context(closing(_frames(container, decoders, notes))):
+                shown.append(frame.time)
+                yield frame
     except (av.FFmpegError, OSError) as error:
         if not shown:
             raise InputError(
@@ -83,19 +92,24 @@ def _log_of(decoder: str) -> Iterator[None]:
         av.logging.set_level(av.logging.ERROR)
 
 
-def _frames(container: "av.container.InputContainer", notes: list[str]) -> Iterator[Frame]:
-    stream = container.streams.video[0]
+def _strict(stream: "av.video.stream.VideoStream") -> "av.CodecContext":
     stream.thread_type = "NONE"
     stream.codec_context.thread_count = 1
     stream.codec_context.options = STRICT
+    return stream.codec_context
+
+
+def _frames(
+    container: "av.container.InputContainer", decoders: list["av.CodecContext"], notes: list[str]
+) -> Generator[Frame]:
+    stream = container.streams.video[0]
     assert stream.time_base is not None
     tells = stream.codec_context.name == "h264"
     order = _Order(float(stream.time_base))
     number = 0
     shape: tuple[int, ...] | None = None
-    for packet in _packets(container, stream, notes):
+    for packet, frames, trouble in _all_decoded(_packets(container, stream, notes), decoders):
         order.expect(packet)
-        frames, trouble = _decoded(packet)
         if trouble:
             order.spoil(packet.pts)
         while frames:
@@ -247,11 +261,40 @@ def _packets(
         yield packet
 
 
-def _decoded(packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
+def _all_decoded(
+    packets: Iterable["av.packet.Packet"], decoders: list["av.CodecContext"]
+) -> Iterator[tuple["av.packet.Packet", list["av.VideoFrame"], bool]]:
+    """Packets in their order, each with its frames and whether the decoder complained."""
+    if len(decoders) == 1:
+        yield from ((packet, *_decoded(packet, decoders[0])) for packet in packets)
+        return
+    idle: queue.SimpleQueue[av.CodecContext] = queue.SimpleQueue()
+    for decoder in decoders:
+        idle.put(decoder)
+
+    def work(packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
+        decoder = idle.get()
+        try:
+            return _decoded(packet, decoder)
+        finally:
+            idle.put(decoder)
+
+    begun: deque[tuple[av.packet.Packet, Future[tuple[list[av.VideoFrame], bool]]]] = deque()
+    with ThreadPoolExecutor(len(decoders)) as pool:
+        for packet in packets:
+            begun.append((packet, pool.submit(work, packet)))
+            if len(begun) > len(decoders):
+                packet, result = begun.popleft()
+                yield packet, *result.result()
+        for packet, result in begun:
+            yield packet, *result.result()
+
+
+def _decoded(packet: "av.packet.Packet", decoder: "av.CodecContext") -> tuple[list["av.VideoFrame"], bool]:
     """A packet's frames, and whether the decoder complained."""
     with av.logging.Capture(local=True) as messages:
         try:
-            frames = packet.decode()
+            frames = decoder.decode(packet)
         except av.FFmpegError:
             return [], True
     complaints = any(level <= av.logging.ERROR for level, _, _ in messages)

@@ -112,13 +112,14 @@ def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
     figures[5] = (mean - spread) / (mean + spread)
 
 
-def fit_dots(image: NDArray, start: Array) -> Dots:
-    """Fit a disc to every start (D, 12); see `tracking.disc`."""
+def fit_dots(image: NDArray, start: Array, wanted: int | None = None) -> Dots:
+    """Fit a disc to every start (D, 12), see `tracking.disc`, or to the first ones wanted, beside the others."""
     start = np.ascontiguousarray(start)
-    fitted, figures = np.empty_like(start), np.empty((len(start), FIGURES))
-    half = len(start) // 2 if len(start) >= ENOUGH_FOR_TWO else 0
+    count = len(start) if wanted is None else wanted
+    fitted, figures = np.empty((count, PARAMETERS)), np.empty((count, FIGURES))
+    half = count // 2 if count >= ENOUGH_FOR_TWO else 0
     other = _POOL.submit(_fit_some, image, start, 0, half, fitted, figures) if half else None
-    _fit_some(image, start, half, len(start), fitted, figures)
+    _fit_some(image, start, half, count, fitted, figures)
     if other is not None:
         other.result()
     return Dots(

@@ -109,7 +109,7 @@ class Newcomers:
         if not len(strange):
             return np.empty((0, 2))
         starts = _starts(strange, parameters)
-        dots = fit_dots(image, np.concatenate([starts, _moved(parameters, place)]))[np.arange(len(starts))]
+        dots = fit_dots(image, np.concatenate([starts, _moved(parameters, place)]), len(starts))
         return apart(dots[self._admitted(dots)], SAME_PLACE * self.family.radius).centre
 
     def _admitted(self, dots: Dots) -> NDArray[np.bool_]:
@@ -138,7 +138,7 @@ class Newcomers:
             expected = carry(pattern.rest[: len(place)], place, rest[None])
             near = np.argsort(np.linalg.norm(place - expected, axis=1))[:NEIGHBOURS]
             starts = np.concatenate([_starts(expected, parameters), _moved(parameters[near], place[near])])
-            dots = fit_dots(image, starts)
+            dots = fit_dots(image, starts, 1)
             since += number >= candidate.since
             if self._admitted(dots)[0] and np.linalg.norm(dots.centre[0] - expected[0]) < same:
                 seen[number] = dots.centre[0], dots.sigma[0]

@@ -175,6 +175,45 @@ def test_frames_that_refer_to_a_damaged_one_are_missing_though_shown_before_it(t
     assert wrong == 0
 
 
+@pytest.mark.parametrize(
+    ("name", "codec", "pixels"), [("a.avi", "mjpeg", "yuvj420p"), ("a.mov", "prores_ks", "yuv422p10le")]
+)
+def test_decoders_side_by_side_give_what_one_gives(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, codec: str, pixels: str
+) -> None:
+    """Pictures that take long and pictures that take no time, one of them damaged: in order, each with its own time."""
+    random = np.random.default_rng(4)
+    pictures = [np.full((240, 320), 4 * k, np.uint8) for k in range(40)]
+    for number in range(0, 40, 3):
+        pictures[number] = random.integers(0, 256, (240, 320)).astype(np.uint8)
+    path = tmp_path / name
+    write_video(path, codec, pixels, pictures=pictures)
+    with av.open(str(path)) as container:
+        packet = [bytes(packet) for packet in container.demux(video=0) if packet.size][12]
+    content = bytearray(path.read_bytes())
+    start = content.find(packet)
+    content[start + len(packet) // 4 : start + len(packet)] = bytes(len(packet) - len(packet) // 4)
+    path.write_bytes(content)
+    found = []
+    for most in (1, 4):
+        monkeypatch.setattr("tracking.decoding.MOST_DECODERS", most)
+        monkeypatch.setattr("os.cpu_count", lambda: 8)
+        found.append(list(open_video(path).read()))
+    assert [k for k, frame in enumerate(found[1]) if frame.picture is None] == [12]
+    for one, other in zip(*found, strict=True):
+        assert one.time == other.time
+        np.testing.assert_array_equal(one.picture, other.picture)
+
+
+def test_reading_can_stop_while_decoders_are_at_work(tmp_path: Path) -> None:
+    write_video(tmp_path / "a.avi", "mjpeg", "yuvj420p")
+    running = threading.active_count()
+    reading = frames_of_file(tmp_path / "a.avi", 0, 0.0, [])
+    next(reading)
+    reading.close()  # type: ignore[attr-defined]
+    assert threading.active_count() == running
+
+
 def test_the_log_is_on_wherever_it_is_needed(tmp_path: Path) -> None:
     """Off for MJPEG alone; a video read beside it whose decoder must be heard turns it on."""
     write_video(tmp_path / "a.avi", "mjpeg", "yuvj420p")
