@@ -265,8 +265,11 @@ class Tracker:
         trusted = -speed - 0.2 * np.minimum(self.missing, 10)
         surprise = float(self.motion.surprise.min())
         sureness = 0.0 if hidden else 1.0 / (1.0 + (2.0 * surprise) ** 2) if np.isfinite(surprise) else 0.3
+        steady = np.zeros(len(expected))
+        if (self.missing > 0).any() and surprise < CALM:  # who is out of sight could take the place of who is in sight
+            steady[self.missing == 0] = 1.0 - surprise / CALM
         reach = SEED_REACH * uncertain
-        match = recognise(self.pattern, self.motion.last, expected, trusted, dots.centre, reach, sureness)
+        match = recognise(self.pattern, self.motion.last, expected, trusted, dots.centre, reach, sureness, steady)
         chosen = dots[np.maximum(match, 0)] if len(dots) else Dots.none(len(match))
         return _only(chosen, match >= 0)
 

@@ -148,7 +148,7 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tupl
     square, shown = coding[where] ** 2, fitted[where] ** 2
     whole = np.maximum(square, shown)
     usual = np.maximum(square.mean(axis=0), 1e-12)
-    moves = np.maximum(np.nanmean(np.diff(pixel, axis=0) ** 2, axis=0)[others.markers] - usual, 0.0)
+    moves = np.maximum(np.nanmean(np.diff(pixel[:, others.markers], axis=0) ** 2, axis=0) - usual, 0.0)
     common = COMMON + WAITING / (1.0 + moves / (SLOW**2 * usual))
     own = np.where(square > 0.0, whole - common * (whole - shown), 0.0)
     # What the others do not tell of the body's motion, and what their errors and its own make of their prediction.

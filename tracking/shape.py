@@ -194,10 +194,11 @@ def _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, tak
 
 
 @njit(cache=True, nogil=True)
-def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, seed, match):  # type: ignore[no-untyped-def]
+def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, seed, match):  # type: ignore[no-untyped-def]
     """Spread the match of a seed, one marker and one dot; fills match (M) with dots, -1 for none.
 
-    Returns the match's score. buckets (R, C, B): dots by square of side `cell` from `origin`, -1 filled.
+    Returns the match's score; a marker counts up to 1 + steady (M) where it is expected. buckets (R, C, B): dots by
+    square of side `cell` from `origin`, -1 filled.
     """
     count = shape.shape[0]
     visited = np.zeros(count, np.bool_)
@@ -238,11 +239,14 @@ def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, ori
             score -= ROUGH * min(misfit * misfit, 1.5)
         away = np.hypot(dots[found, 0] - expected[marker, 0], dots[found, 1] - expected[marker, 1])
         score -= far * min(away / spacing[marker], 3.0)
+        score += steady[marker] * max(1.0 - away / spacing[marker], 0.0)
     return score
 
 
 @njit(cache=True, nogil=True)
-def _best_growth(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, seeds, enough, best):  # type: ignore[no-untyped-def]
+def _best_growth(  # type: ignore[no-untyped-def]
+    shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, seeds, enough, best
+):  # fmt: skip
     """Tries seeds (S, 2) of marker and dot until a score reaches `enough`; fills best (M)."""
     match = np.empty(shape.shape[0], np.int64)
     highest = -np.inf
@@ -250,7 +254,9 @@ def _best_growth(shape, expected, linear, spacing, neighbours, dots, buckets, ce
         # A pair that the best match already holds would grow into the same.
         if highest > -np.inf and best[seeds[s, 0]] == seeds[s, 1]:
             continue
-        score = _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, seeds[s], match)
+        score = _grow(
+            shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, seeds[s], match
+        )
         if score > highest:
             highest = score
             best[:] = match
@@ -260,8 +266,9 @@ def _best_growth(shape, expected, linear, spacing, neighbours, dots, buckets, ce
 
 
 def recognise(
-    pattern: Pattern, shape: Array, expected: Array, trusted: Array, dots: Array, reach: float, sureness: float
-) -> Array:
+    pattern: Pattern, shape: Array, expected: Array, trusted: Array, dots: Array, reach: float, sureness: float,
+    steady: Array,
+) -> Array:  # fmt: skip
     """The dot of each marker, (M), -1 for none.
 
     Args:
@@ -272,6 +279,7 @@ def recognise(
         dots: of the new picture [px], (D, 2).
         reach: how far from where it is expected a seed's dot may be [spacings].
         sureness: of the expected motion as a whole, 0 to 1.
+        steady: how much more a marker that is where it is expected counts than another, (M).
     """
     nobody = np.full(len(shape), -1)
     if not len(dots):
@@ -279,7 +287,7 @@ def recognise(
     search = _Search.of(pattern, dots)
     seeds = search.seeds(expected, trusted, reach)
     far = FAR * sureness
-    best, score = search.grow(shape, expected, _local_maps(pattern, shape, expected), far, seeds)
+    best, score = search.grow(shape, expected, _local_maps(pattern, shape, expected), far, steady, seeds)
     if (best >= 0).sum() >= min(len(shape), len(dots)):
         return best
     # Markers and dots are left over: the body may stand where nobody expects it.
@@ -287,7 +295,7 @@ def recognise(
         cos, sin = np.cos(turn), np.sin(turn)
         linear = np.tile([[cos, -sin], [sin, cos]], (len(shape), 1, 1))
         for base in (shape, pattern.rest):
-            other, other_score = search.grow(base, expected, linear, far, seeds)
+            other, other_score = search.grow(base, expected, linear, far, steady, seeds)
             if other_score > score:
                 best, score = other, other_score
     return best
@@ -309,7 +317,8 @@ def match_shape(pattern: Pattern, dots: Array, far: float) -> tuple[float, NDArr
         near = tree.query(places[some], min(SEED_DOTS, len(dots)))[1].reshape(len(some), -1)
         seeds.append(np.stack([np.repeat(some, near.shape[1]), near.ravel()], axis=1))
     linear = np.tile(np.eye(2), (count, 1, 1))
-    match, score = _Search.of(pattern, dots).grow(pattern.rest, pattern.rest, linear, far, np.concatenate(seeds))
+    search, nobody = _Search.of(pattern, dots), np.zeros(count)
+    match, score = search.grow(pattern.rest, pattern.rest, linear, far, nobody, np.concatenate(seeds))
     return score, match
 
 
@@ -341,14 +350,14 @@ class _Search:
         return np.array([pair[1:] for pair in pairs], dtype=np.int64).reshape(-1, 2)
 
     def grow(
-        self, shape: Array, expected: Array, linear: Array, far: float, seeds: NDArray[np.int64]
+        self, shape: Array, expected: Array, linear: Array, far: float, steady: Array, seeds: NDArray[np.int64]
     ) -> tuple[NDArray[np.int64], float]:
         """The best match (M) that grows from any seed, and its score."""
         match = np.full(len(shape), -1)
         enough = 0.97 * min(len(shape), len(self.dots))
         score = _best_growth(
             shape, expected, linear, self.pattern.spacing, self.pattern.neighbours, self.dots, self.buckets, self.cell,
-            self.origin, far, seeds, enough, match,
+            self.origin, far, steady, seeds, enough, match,
         )  # fmt: skip
         return match, score
 
