@@ -58,7 +58,7 @@ class Effort:
     fine_large: int | None  # None leaves large shapes out, 0 only evaluates there
 
 
-FULL, QUICK = Effort(60, 1000, 40, 30, 12), Effort(20, 150, 8, 5, None)
+FULL, QUICK = Effort(60, 1000, 40, 30, 12), Effort(5, 50, 4, 2, None)
 
 
 class Study:
