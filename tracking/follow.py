@@ -39,7 +39,7 @@ class PixelTracks:
 
     Attributes:
         time: [s], (T), NaN where the video does not say.
-        pixel: (T, D, 2), NaN where not measured.
+        pixel: (T, D, 2), NaN where not measured; where the coding is known, as the others' motion mends it.
         sigma: one standard deviation along x and y [px], (T, D, 2).
         start: positions in the first frame that shows markers [px], (D, 2); of late ones where the others carry them.
         late: how many markers, the last ones, came into sight later.
