@@ -55,10 +55,11 @@ class Effort:
     srl: int
     fine: int
     left_out: int
+    left_out_lesson: int  # passes of warm start
     fine_large: int | None  # None leaves large shapes out, 0 only evaluates there
 
 
-FULL, QUICK = Effort(60, 1000, 40, 30, 12), Effort(5, 50, 4, 2, None)
+FULL, QUICK = Effort(60, 1000, 40, 30, 20, 12), Effort(5, 25, 4, 1, 3, None)
 
 
 class Study:
@@ -198,7 +199,8 @@ class Study:
         rows: list[dict[str, Any]] = []
         for shape in BEAMS:
             others = [self.few(other) for other in BEAMS if other != shape]
-            model = self.fit(f"without-{shape}", "rafl", others, epochs=self.effort.left_out, warm_start=20)
+            how = {"epochs": self.effort.left_out, "warm_start": self.effort.left_out_lesson}
+            model = self.fit(f"without-{shape}", "rafl", others, **how)
             rows += self.errors(shape, {"rafl-of-the-others": model})
         return pd.DataFrame(rows, columns=COLUMNS)
 
