@@ -16,6 +16,7 @@ from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, eight_bits, find_spots, fit_dots, start_of
 from tracking.family import Family, find_family
 from tracking.frame import Frame
+from tracking.memory import Memory
 from tracking.motion import Motion
 from tracking.newcomers import Newcomer, Newcomers
 from tracking.noise import places_and_errors
@@ -29,6 +30,7 @@ WORST = 10  # frames whose pictures are kept
 CALM = 0.22  # spacings: surprise up to which the dot at a marker's predicted place is its own
 STRAY = 0.33  # spacings: how far from its prediction a dot found there may be
 SEED_REACH = 2.2  # spacings: how far from where it is expected a marker may be
+DISPUTED = 0.5  # of the distance from another marker's place: how far from its own a dot that comes back may be
 RECHECK = 4  # frames between searches for markers out of sight
 NOTHING = np.empty((0, 2))
 
@@ -185,6 +187,7 @@ class Tracker:
         self.pattern = Pattern.of(first.centre)
         self.parameters = first.parameters.copy()
         self.motion = Motion(first.centre)
+        self.memory = Memory(first.centre)
         self.missing = np.zeros(len(first), dtype=np.int64)  # frames since each was seen
         self.searched = 0  # frames since the last search
         self.newcomers = Newcomers(family)
@@ -202,6 +205,7 @@ class Tracker:
             better = dots is None or np.isfinite(found.sigma[:, 0]).sum() > np.isfinite(dots.sigma[:, 0]).sum()
             dots = found if better or dots is None else dots
             self.searched = 0
+        dots = _only(dots, np.isfinite(dots.sigma[:, 0]) & self._undisputed(dots))
         self._learn(dots)
         return dots
 
@@ -220,6 +224,7 @@ class Tracker:
             if number in newcomer.seen:
                 places[-1] = newcomer.seen[number][0]
             self.motion.join(places)
+            self.memory.join(newcomer.rest)
             self.pattern = Pattern.of(np.concatenate([rest, newcomer.rest[None]]))
             self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
             self.missing = np.append(self.missing, 0 if number in newcomer.seen else 1)
@@ -234,7 +239,7 @@ class Tracker:
         if not seen.any():
             return self.motion.last
         expected = self.motion.expected()
-        return expected if seen.all() else self.pattern.carried(expected, seen)
+        return expected if seen.all() else self.memory.carried(expected, seen)
 
     def _where_expected(self, image: NDArray, expected: Array) -> Dots | None:
         """The dots at the markers' expected places; None where they are not all their own."""
@@ -273,6 +278,26 @@ class Tracker:
         chosen = dots[np.maximum(match, 0)] if len(dots) else Dots.none(len(match))
         return _only(chosen, match >= 0)
 
+    def _undisputed(self, dots: Dots) -> NDArray[np.bool_]:
+        """Which markers' dots cannot as well be another's.
+
+        Those of markers that were in sight, and of the others those that lie where these put their marker, less than
+        half as far from there as from where they put another marker out of sight; one by one, each a help for the next.
+        """
+        doubtful = np.isfinite(dots.sigma[:, 0])
+        sure = doubtful & (self.missing == self.missing.min())
+        while sure.any() and (doubtful & ~sure).any():
+            place = self.memory.carried(dots.centre, sure)
+            asked, out = np.flatnonzero(doubtful & ~sure), np.flatnonzero(~sure)
+            gaps = np.linalg.norm(dots.centre[asked][:, None] - place[out], axis=2)
+            mine = asked[:, None] == out
+            own, other = gaps[mine], np.where(mine, np.inf, gaps).min(axis=1)
+            clear = (own < DISPUTED * other) & (own < DISPUTED * self.pattern.spacing[asked])
+            if not clear.any():
+                return sure
+            sure[asked[clear]] = True
+        return sure | doubtful
+
     def _learn(self, dots: Dots) -> None:
         seen = np.isfinite(dots.sigma[:, 0])
         was = self.missing == 0
@@ -280,7 +305,8 @@ class Tracker:
         place = dots.centre
         if not seen.all():
             place = np.where(seen[:, None], place, self._expected())
-            place = self.pattern.carried(place, seen)
+            place = self.memory.carried(place, seen)
+        self.memory.add(place, seen)
         self.motion.remember(place)
         self.missing = np.where(seen, 0, self.missing + 1)
         self.parameters[seen] = dots.parameters[seen]

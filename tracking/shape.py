@@ -19,6 +19,7 @@ Array = NDArray[Any]
 
 NEIGHBOURS = 8
 GATE = 0.36  # of a marker's spacing: how far from where its neighbours put it a dot may be
+AROUND = 6  # markers that carry another
 STIFFNESS = 0.04  # of neighbours' own spread: how firmly local maps hold on to the expected one
 FAR = 0.12  # of a marker: what a dot one spacing from its expected place costs, where motion is known
 TURNS = np.radians([0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0])  # tried where the body is lost
@@ -50,51 +51,67 @@ class Pattern:
         spacing = distance[:, 1]
         return cls(rest, np.maximum(spacing, 0.5 * np.median(spacing)), neighbours)
 
-    def carried(self, position: Array, known: NDArray[np.bool_]) -> Array:
-        """Where the unknown markers are, by the affine map of the nearest known ones from rest, (M, 2)."""
-        result = position.copy()
-        if known.any():
-            result[~known] = carry(self.rest[known], position[known], self.rest[~known])
-        return result
 
-
-def carry(source: Array, target: Array, points: Array) -> Array:
+@njit(cache=True, nogil=True)
+def carry(source, target, points):  # type: ignore[no-untyped-def]
     """Where points (P, 2) go by the affine map of the nearest of `source`, which go to `target` (N, 2)."""
+    count = len(source)
     result = np.empty_like(points)
-    if not len(points):
-        return result
-    count = min(6, len(source))
-    nearest = cKDTree(source).query(points, count)[1].reshape(len(points), count)
     # Known markers in one line say nothing across it but that the body turns with them.
-    even = np.ones(len(source))
-    matrix = _affine(source, target, even, _similarity(source, target, even))
-    for number, around in enumerate(nearest):
-        weight = 1.0 / (np.linalg.norm(source[around] - points[number], axis=1) + 1e-9)
-        local = _affine(source[around], target[around], weight, matrix)
-        share = weight / weight.sum()
-        offset = points[number] - share @ source[around]
-        result[number] = share @ target[around] + local @ offset
+    turn = _similarity(source, target)
+    _, _, matrix = _affine(source, target, np.arange(count), np.ones(count), turn)
+    for p in range(len(points)):
+        away = np.hypot(source[:, 0] - points[p, 0], source[:, 1] - points[p, 1])
+        near = np.argsort(away)[:AROUND]
+        middle, goes, local = _affine(source, target, near, 1.0 / (away[near] + 1e-9), matrix)
+        x, y = points[p] - middle
+        result[p, 0] = goes[0] + local[0, 0] * x + local[0, 1] * y
+        result[p, 1] = goes[1] + local[1, 0] * x + local[1, 1] * y
     return result
 
 
-def _similarity(source: Array, target: Array, weight: Array) -> Array:
+@njit(cache=True, nogil=True)
+def _similarity(source, target):  # type: ignore[no-untyped-def]
     """The turn and scale that best take source to target (N, 2), as a matrix; none from a single point."""
-    share = weight / weight.sum()
-    a = (source - share @ source) @ [1.0, 1.0j]
-    b = (target - share @ target) @ [1.0, 1.0j]
-    size = float(share @ np.abs(a) ** 2)
-    z = (share * np.conj(a)) @ b / size if size > 1e-12 else 1.0
-    return np.array([[np.real(z), -np.imag(z)], [np.imag(z), np.real(z)]])
+    count = len(source)
+    sx, sy, tx, ty = source[:, 0].mean(), source[:, 1].mean(), target[:, 0].mean(), target[:, 1].mean()
+    size = along = across = 0.0
+    for k in range(count):
+        ux, uy, vx, vy = source[k, 0] - sx, source[k, 1] - sy, target[k, 0] - tx, target[k, 1] - ty
+        size += ux * ux + uy * uy
+        along += ux * vx + uy * vy
+        across += ux * vy - uy * vx
+    if size <= 1e-12 * count:
+        return np.eye(2)
+    return np.array([[along, -across], [across, along]]) / size
 
 
-def _affine(source: Array, target: Array, weight: Array, expected: Array) -> Array:
-    """The linear part of the map from source to target (N, 2), drawn a little towards `expected`."""
+@njit(cache=True, nogil=True)
+def _affine(source, target, chosen, weight, expected):  # type: ignore[no-untyped-def]
+    """The map of the chosen points' source to their target (N, 2), its linear part drawn a little towards `expected`.
+
+    Returns the weighted mean of the source, where that goes, and the linear part.
+    """
     share = weight / weight.sum()
-    source = source - share @ source
-    target = target - share @ target
-    ridge = STIFFNESS * float(share @ (source**2).sum(1)) + 1e-12
-    moment = (share[:, None] * source).T @ source + ridge * np.eye(2)
-    return ((share[:, None] * target).T @ source + ridge * expected) @ np.linalg.inv(moment)
+    middle, goes = np.zeros(2), np.zeros(2)
+    for k in range(len(chosen)):
+        middle += share[k] * source[chosen[k]]
+        goes += share[k] * target[chosen[k]]
+    mxx = mxy = myy = nxx = nxy = nyx = nyy = 0.0
+    for k in range(len(chosen)):
+        ux, uy = source[chosen[k]] - middle
+        vx, vy = target[chosen[k]] - goes
+        mxx += share[k] * ux * ux
+        mxy += share[k] * ux * uy
+        myy += share[k] * uy * uy
+        nxx += share[k] * vx * ux
+        nxy += share[k] * vx * uy
+        nyx += share[k] * vy * ux
+        nyy += share[k] * vy * uy
+    ridge = STIFFNESS * (mxx + myy) + 1e-12
+    moment = np.array([[mxx + ridge, mxy], [mxy, myy + ridge]])
+    cross = np.array([[nxx, nxy], [nyx, nyy]]) + ridge * expected
+    return middle, goes, cross @ np.linalg.inv(moment)
 
 
 @njit(cache=True, nogil=True)

@@ -74,6 +74,25 @@ def test_hidden_dots_come_back_under_their_names() -> None:
     assert np.abs(found[:, 3:] - truth[:, 3:]).max() < 0.3
 
 
+def test_who_comes_back_into_a_curl_is_not_taken_for_its_neighbour() -> None:
+    """A strip curls by up to 2.2 rad behind a screen's edge, so that returning dots come close to where others stood.
+
+    Guessed from the shape at rest, 24 places bore a neighbour's name.
+    """
+    turn = 0.45 * np.sin(0.3 * np.arange(60))[:, None] * np.arange(6)
+    step = 30.0 * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
+    across = 17.0 * np.stack([np.cos(turn), -np.sin(turn)], axis=-1)
+    middle = np.cumsum(step, axis=1)
+    truth = np.stack([middle + across, middle - across], axis=2).reshape(60, 12, 2)
+    truth += np.array([180.0, 20.0])
+    behind = truth[..., 1] > np.median(truth[..., 1])
+    behind[0] = False
+    tracks = follow(Drawn(np.where(behind[..., None], np.nan, truth)), lambda: None)  # type: ignore[arg-type]
+    away = np.linalg.norm(tracks.pixel[:, order(tracks.start, truth[0])] - truth, axis=2)
+    assert np.nanmax(away) < 0.5
+    assert np.isfinite(away[~behind]).mean() > 0.7
+
+
 def test_dots_hidden_at_first_are_taken_in() -> None:
     """A hand holds the specimen for fifteen frames, then it swings; the dots are known from the moment they show."""
     rest = grid()
