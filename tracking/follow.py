@@ -205,7 +205,7 @@ class Tracker:
             better = dots is None or np.isfinite(found.sigma[:, 0]).sum() > np.isfinite(dots.sigma[:, 0]).sum()
             dots = found if better or dots is None else dots
             self.searched = 0
-        dots = _only(dots, np.isfinite(dots.sigma[:, 0]) & self._undisputed(dots))
+        dots = _only(dots, self._undisputed(dots))
         self._learn(dots)
         return dots
 
@@ -279,16 +279,16 @@ class Tracker:
         return _only(chosen, match >= 0)
 
     def _undisputed(self, dots: Dots) -> NDArray[np.bool_]:
-        """Which markers' dots cannot as well be another's.
+        """Which markers are seen, and not by dots that could as well be another's.
 
-        Those of markers that were in sight, and of the others those that lie where these put their marker, less than
-        half as far from there as from where they put another marker out of sight; one by one, each a help for the next.
+        Those that were in sight before; and of the others those whose dots lie where these put them, less than half as
+        far from there as from where they put another marker out of sight, one by one, each a help for the next.
         """
-        doubtful = np.isfinite(dots.sigma[:, 0])
-        sure = doubtful & (self.missing == self.missing.min())
-        while sure.any() and (doubtful & ~sure).any():
+        shown = np.isfinite(dots.sigma[:, 0])
+        sure = shown & (self.missing == self.missing.min())
+        while sure.any() and (shown & ~sure).any():
             place = self.memory.carried(dots.centre, sure)
-            asked, out = np.flatnonzero(doubtful & ~sure), np.flatnonzero(~sure)
+            asked, out = np.flatnonzero(shown & ~sure), np.flatnonzero(~sure)
             gaps = np.linalg.norm(dots.centre[asked][:, None] - place[out], axis=2)
             mine = asked[:, None] == out
             own, other = gaps[mine], np.where(mine, np.inf, gaps).min(axis=1)
@@ -296,7 +296,7 @@ class Tracker:
             if not clear.any():
                 return sure
             sure[asked[clear]] = True
-        return sure | doubtful
+        return shown
 
     def _learn(self, dots: Dots) -> None:
         seen = np.isfinite(dots.sigma[:, 0])
