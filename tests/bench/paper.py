@@ -56,10 +56,11 @@ class Effort:
     fine: int
     left_out: int
     left_out_lesson: int  # passes of warm start
+    left_out_recordings: int  # to train on, of each of the other shapes
     fine_large: int | None  # None leaves large shapes out, 0 only evaluates there
 
 
-FULL, QUICK = Effort(60, 1000, 40, 30, 20, 12), Effort(5, 25, 4, 1, 3, None)
+FULL, QUICK = Effort(60, 1000, 40, 30, 20, 2, 12), Effort(5, 25, 4, 1, 3, 1, None)
 
 
 class Study:
@@ -115,9 +116,10 @@ class Study:
         return read_dataset(path)
 
     def few(self, shape: str) -> Dataset:
-        """Two training recordings and one to validate by."""
+        """A few training recordings and one to validate by."""
         dataset = self.dataset(shape, "train", "val")
-        names = dataset.split("train")[:: len(dataset.split("train")) // 2][:2] + dataset.split("val")[:1]
+        some = dataset.split("train")[:: len(dataset.split("train")) // 2][: self.effort.left_out_recordings]
+        names = some + dataset.split("val")[:1]
         return replace(dataset, trajectories={name: dataset.trajectories[name] for name in names})
 
     def fit(self, run: str, method: str, datasets: list[Dataset], **changes: Any) -> FittedModel:
@@ -195,7 +197,7 @@ class Study:
         return pd.DataFrame(rows, columns=COLUMNS)
 
     def leave_one_out(self) -> pd.DataFrame:
-        """Each beam shape by a model of two recordings of each of the four others."""
+        """Each beam shape by a model of a few recordings of each of the four others."""
         rows: list[dict[str, Any]] = []
         for shape in BEAMS:
             others = [self.few(other) for other in BEAMS if other != shape]
