@@ -12,6 +12,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from groundwork import InputError
+from tracking.affine import carry
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, eight_bits, find_spots, fit_dots, start_of
 from tracking.family import Family, find_family
@@ -20,7 +21,7 @@ from tracking.memory import Memory
 from tracking.motion import Motion
 from tracking.newcomers import Newcomer, Newcomers
 from tracking.noise import places_and_errors
-from tracking.shape import Pattern, carry, recognise
+from tracking.shape import Pattern, recognise
 from tracking.video import Video
 
 Array = NDArray[Any]
@@ -238,8 +239,7 @@ class Tracker:
         seen = self.missing == 0
         if not seen.any():
             return self.motion.last
-        expected = self.motion.expected()
-        return expected if seen.all() else self.memory.carried(expected, seen)
+        return self.memory.carried(self.motion.expected(), seen)
 
     def _where_expected(self, image: NDArray, expected: Array) -> Dots | None:
         """The dots at the markers' expected places; None where they are not all their own."""

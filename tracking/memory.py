@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tracking.shape import carry
+from tracking.affine import carry
 
 Array = NDArray[Any]
 

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tracking.affine import carry
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, find_spots, fit_dots, start_of
 from tracking.family import Family
-from tracking.shape import NEIGHBOURS, Pattern, carry
+from tracking.shape import NEIGHBOURS, Pattern
 
 Array = NDArray[Any]
 

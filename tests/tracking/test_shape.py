@@ -1,7 +1,8 @@
 import numpy as np
 import pytest
 
-from tracking.shape import Pattern, carry, recognise
+from tracking.affine import carry
+from tracking.shape import Pattern, recognise
 
 
 def grid(columns: int = 9, rows: int = 3) -> np.ndarray:
