@@ -35,8 +35,8 @@ class Dots:
 
     Attributes:
         centre: [px], (D, 2).
-        sigma: standard deviation of the centre along x and y, from the fit's residual [px], (D, 2); NaN
-            where the fit failed.
+        sigma: standard deviation of the centre along x and y, from the fit's residual and how far pixels that are not
+            quite trusted pull [px], (D, 2); NaN where the fit failed.
         parameters: of the fitted discs, see `tracking.disc`, (D, 12).
         radius: geometric mean of the semi-axes [px], (D).
         flattening: ratio of the axes, 1 for a circle, (D).
@@ -105,8 +105,8 @@ def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
         return
     white_x, white_y = quality[1] * quality[5], quality[2] * quality[5]
     shared = quality[3] + quality[4] > SHARED_NOISE * (white_x + white_y)
-    figures[0] = np.sqrt((quality[3] if shared else white_x) + LEAST_SIGMA**2)
-    figures[1] = np.sqrt((quality[4] if shared else white_y) + LEAST_SIGMA**2)
+    figures[0] = np.sqrt((quality[3] if shared else white_x) + quality[7] ** 2 + LEAST_SIGMA**2)
+    figures[1] = np.sqrt((quality[4] if shared else white_y) + quality[8] ** 2 + LEAST_SIGMA**2)
     spread = np.sqrt(max(mean * mean - determinant, 0.0))
     figures[4] = 1.0 / np.sqrt(determinant)
     figures[5] = (mean - spread) / (mean + spread)

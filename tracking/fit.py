@@ -31,11 +31,12 @@ from tracking.minimise import (
 )
 
 # Converged; the centre's variances by independent errors of one grey level (2), by blocks (2); mean squared residual;
-# share used.
-QUALITY = 7
+# share used; how far the pixels that are not quite trusted pull the centre (2).
+QUALITY = 9
 OUTLYING = 0.12  # of the contrast: a pixel farther off than this shows something else than the dot
 STRANGE = 0.25  # of the contrast: a level this far from what the start expects
 LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edge does not describe any more
+DOUBTED = 0.9  # weight: below it a pixel is not quite trusted
 BLOCK = 4  # px: errors closer than this are not taken to be independent
 
 
@@ -60,7 +61,8 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
     """The last small step, by the factor at hand, and the centre's variances; fills quality.
 
     Variances as independent errors of the residual's size give them, and as the scores summed over blocks
-    of pixels say: compression leaves errors that neighbours share. Returns the size of the step.
+    of pixels say: compression leaves errors that neighbours share. Pixels that are not quite trusted, at a highlight's
+    edge, may all be off to one side: how far they pull the centre is an error by itself. Returns the size of the step.
     """
     n = PARAMETERS
     pull = np.zeros((2, n))  # rows of H^-1: how the centre follows each score
@@ -75,14 +77,14 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
         row, column = (int(w[Y + k]) + reach) // BLOCK, (int(w[X + k]) + reach) // BLOCK
         w[BLOCK_OF + k] = row * side + column
     blocks = np.zeros((2, side * side))
-    white = np.zeros(2)
+    white, doubted = np.zeros(2), np.zeros(2)
     score = np.zeros(n)
     squares = 0.0
     used = 0.0
     for first in range(0, count, CHUNK):
         some = min(CHUNK, count - first)
         linearise(p, smeared, x0, y0, first, some, w)
-        _add_influence(first, some, w, pull, white, blocks)
+        _add_influence(first, some, w, pull, white, blocks, doubted)
         squares_here, used_here = add_scores(first, some, w, score)
         squares += squares_here
         used += used_here
@@ -92,6 +94,7 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
             shared += blocks[axis, cell] ** 2
         quality[1 + axis] = white[axis]
         quality[3 + axis] = shared
+        quality[7 + axis] = doubted[axis]
     quality[5] = squares / max(used - n, 1.0)
     quality[6] = used / count
     substitute(L, score)
@@ -102,8 +105,8 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
 
 
 @njit(**FAST)
-def _add_influence(first, count, w, pull, white, blocks):  # type: ignore[no-untyped-def]
-    """Each pixel's weight in the centre, squared and summed, and times its residual summed by block."""
+def _add_influence(first, count, w, pull, white, blocks, doubted):  # type: ignore[no-untyped-def]
+    """Each pixel's weight in the centre, squared, and times its residual, summed by block and over doubted ones."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
     for axis in range(2):
@@ -116,11 +119,14 @@ def _add_influence(first, count, w, pull, white, blocks):  # type: ignore[no-unt
             for k in range(count):
                 w[influence + k] += factor * w[row + k]
         total = np.float32(0.0)
+        pulled = np.float32(0.0)
         for k in range(count):
             w[influence + k] *= w[WEIGHT + first + k]
             total += w[influence + k] * w[influence + k]
             w[influence + k] *= w[J + 12 * CHUNK + k]
+            pulled += w[influence + k] if w[WEIGHT + first + k] < np.float32(DOUBTED) else np.float32(0.0)
         white[axis] += total
+        doubted[axis] += pulled
     for k in range(count):
         block = int(w[BLOCK_OF + first + k])
         blocks[0, block] += w[WEIGHTED + k]

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from support import picture
 
+from tracking.artificial import Scene, draw, expose
 from tracking.dots import Dots, find_dots
 
 
@@ -47,6 +48,23 @@ def test_noise_errors_reach_the_bound_and_sigma_says_so() -> None:
     bound = 4.0 / 130.0 * np.sqrt(2 * edge / (8.0 * np.sqrt(np.pi)))
     assert rms < 1.3 * bound
     assert np.median(sigmas) == pytest.approx(rms, rel=0.3)
+
+
+def test_sigma_knows_of_highlights() -> None:
+    """Each dot with a highlight over its edge: what of it is not left out pulls the centre, and sigma tells."""
+    scores = []
+    for seed in range(3):
+        random = np.random.default_rng(seed)
+        x, y = np.meshgrid(np.arange(60.0, 740.0, 48.0), np.arange(60.0, 540.0, 48.0))
+        centre = np.stack([x.ravel(), y.ravel()], axis=1) + random.uniform(-3, 3, (x.size, 2))
+        ellipses = np.column_stack([centre, np.tile([8.0, 8.0, 0.0], (len(centre), 1))])
+        scene = Scene((800, 600), noise=4.0, slope=0.25, glare=1.0, fine=4)
+        dots = find_dots(expose(draw(scene, ellipses, random), scene, random), True)
+        assert len(dots) == len(centre)
+        for place in centre:
+            k = nearest(dots, (place[0], place[1]))
+            scores.append((dots.centre[k] - place) / dots.sigma[k])
+    assert np.sqrt((np.array(scores) ** 2).mean()) == pytest.approx(1.0, abs=0.15)
 
 
 def test_neighbours_do_not_pull() -> None:
