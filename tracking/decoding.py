@@ -121,7 +121,7 @@ def _frames(
                 order.spoil(stamp)
             steps = None
             if tells and number % ASKED == 0 and picture is not None:
-                steps = _steps(frame)
+                steps, picture = _steps(frame), picture.copy()
                 del frame
                 gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
             yield from order.shown(_Decoded(stamp, picture, steps))
@@ -327,7 +327,10 @@ def quarter_turns(frame: "av.VideoFrame") -> int:
 
 
 def _grey(frame: "av.VideoFrame") -> NDArray:
-    """The luma plane as it is stored, or the grey of a format without one, turned as it is to be shown."""
+    """The luma plane as it is stored, or the grey of a format without one, turned as it is to be shown.
+
+    It lies in the decoder's own memory where it can: a copy takes a tenth of the time of decoding.
+    """
     name, bits = frame.format.name, frame.format.components[0].bits
     planar = name.startswith(("yuv4", "yuvj4", "gray", "nv1", "nv2", "p01", "p21", "yuva4")) and not name.endswith("be")
     if planar and bits <= 16 and not name.startswith("grayf"):
@@ -336,7 +339,7 @@ def _grey(frame: "av.VideoFrame") -> NDArray:
         rows = np.frombuffer(plane, kind).reshape(plane.height, -1)[:, : plane.width]
         # p010 and its like keep their bits at the upper end.
         high = name.startswith(("p01", "p21"))
-        picture = rows.copy() if bits == 8 else scaled(rows, 16 if high else bits)
+        picture = np.ascontiguousarray(rows) if bits == 8 else scaled(rows, 16 if high else bits)
     elif bits > 8:
         picture = scaled(frame.to_ndarray(format="gray16le"), 16)
     else:
