@@ -19,7 +19,7 @@ STILL, LAGGING = 0.45, 1.0
 # The share of these errors' variance that all markers have in common: of markers that move far from frame to frame,
 # and how much more where they move less than SLOW of these errors a frame and wait together until the encoder takes
 # notice. Measured likewise; at the quickest presets most of it is common.
-COMMON, WAITING, SLOW = 0.03, 0.6, 4.0
+COMMON, WAITING, SLOW = 0.05, 0.6, 4.0
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
 MODES = 12  # of the body's motion, at most
 TELLING = 0.3  # of a fit's variance: an excess smaller than this may be chance
@@ -147,15 +147,23 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tupl
     where = np.ix_(others.frames, others.markers)
     square, shown = coding[where] ** 2, fitted[where] ** 2
     whole = np.maximum(square, shown)
-    usual = np.maximum(square.mean(axis=0), 1e-12)
-    moves = np.maximum(np.nanmean(np.diff(pixel[:, others.markers], axis=0) ** 2, axis=0) - usual, 0.0)
-    common = COMMON + WAITING / (1.0 + moves / (SLOW**2 * usual))
+    usual = np.maximum(square.mean(axis=0), 1e-12).sum(axis=1, keepdims=True)
+    way = np.nanmean(np.diff(pixel[:, others.markers], axis=0) ** 2, axis=0).sum(axis=1, keepdims=True)
+    waiting = usual / (usual + np.maximum(way - usual, 0.0) / SLOW**2)  # 1 where a marker keeps still, 0 where it flies
+    common = COMMON + WAITING * waiting
     own = np.where(square > 0.0, whole - common * (whole - shown), 0.0)
     # What the others do not tell of the body's motion, and what their errors and its own make of their prediction.
     share = (others.leverage / (1.0 - others.leverage))[..., None]
     least = (others.carried + share) * whole.mean(axis=0)
     irregular = np.maximum(others.missed - own.mean(axis=0), least)
     part = own / np.maximum(own + irregular, (others.away / SURPRISING) ** 2)
+    # Where the others leave less of all paths together than these errors would be, the errors are smaller; but for
+    # markers that keep still, whose errors keep still with them and are not seen.
+    left = (others.missed / (1.0 + others.carried)).mean(axis=0)
+    smaller = np.minimum(left / np.maximum(own.mean(axis=(0, 1)), 1e-12), 1.0)
+    smaller = waiting + (1.0 - waiting) * smaller
+    irregular = np.maximum(others.missed - smaller * own.mean(axis=0), smaller * least)
+    rest = smaller * (whole - own + (1.0 - part) ** 2 * own) + part**2 * irregular
     off, gone = np.zeros((2, *pixel.shape))
-    off[where], gone[where] = part * others.away, part * own
+    off[where], gone[where] = part * others.away, np.where(square > 0.0, whole - rest, 0.0)
     return off, gone

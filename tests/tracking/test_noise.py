@@ -113,5 +113,5 @@ def test_sigma_knows_of_compression(tmp_path: Path, crf: str, swing: float) -> N
     order = np.linalg.norm(place[0][:, None] - tracks.start[None], axis=2).argmin(axis=1)
     error, sigma = tracks.pixel[:, order] - place, tracks.sigma[:, order]
     assert 0.7 < np.sqrt((sigma**2).mean() / (error**2).mean()) < 1.8  # the upper end where the error is 0.004 px
-    assert np.mean(np.abs(error) < sigma) == pytest.approx(0.7, abs=0.13)
+    assert np.mean(np.abs(error) < sigma) == pytest.approx(0.68, abs=0.14)
     assert np.mean((np.abs(error) > 0.25) & (np.abs(error) > 4.0 * sigma)) < 5e-3
