@@ -16,8 +16,8 @@ class Frame:
         time: since the first frame [s]; NaN where unknown.
         picture: grey levels of 0 to 255 (H, W), uint8, or float32 where the video has more than 8 bits;
             None where the frame is damaged.
-        steps: by which H.264 rounded the changes in each square of 16 px [grey levels], (H / 16, W / 16); None in most
-            frames, and where the decoder does not say.
+        steps: by which H.264 rounded the changes in each square of 16 px [grey levels], (H / 16, W / 16), larger where
+            the encoder says that it was in a hurry; None in most frames, and where the decoder does not say.
     """
 
     time: float

@@ -14,11 +14,11 @@ Array = NDArray[Any]
 
 # Errors of coded pictures beside those that independent errors of one step in each pixel would make: along an axis in
 # which the marker keeps still, and along its way, where the encoder lets it lag. Measured on libx264, crf 18 to 28,
-# dots of 8 px; its quickest presets lag twice as far.
+# dots of 8 px, medium preset; of quicker ones the decoding tells larger steps.
 STILL, LAGGING = 0.45, 1.0
 # The share of these errors' variance that all markers have in common: of markers that move far from frame to frame,
 # and how much more where they move less than SLOW of these errors a frame and wait together until the encoder takes
-# notice. Measured likewise; at the quickest presets most of it is common.
+# notice. Measured likewise.
 COMMON, WAITING, SLOW = 0.05, 0.6, 4.0
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
 MODES = 12  # of the body's motion, at most

@@ -90,9 +90,19 @@ def test_few_frames_say_nothing(random: np.random.Generator) -> None:
     np.testing.assert_array_equal(coded(pixel, 0.1)[0], pixel)
 
 
-@pytest.mark.parametrize(("crf", "swing"), [("4", 2.0), ("23", 2.0), ("23", 20.0), ("28", 2.0)])
-def test_sigma_knows_of_compression(tmp_path: Path, crf: str, swing: float) -> None:
-    """A beam of dots that swings by up to 2 or 20 px, coded finely or so coarsely that most motion is passed over."""
+@pytest.mark.parametrize(
+    ("crf", "swing", "preset"),
+    [
+        ("4", 2.0, "medium"),
+        ("23", 2.0, "medium"),
+        ("23", 20.0, "medium"),
+        ("28", 2.0, "medium"),
+        ("23", 2.0, "veryfast"),
+        ("23", 8.0, "faster"),
+    ],
+)
+def test_sigma_knows_of_compression(tmp_path: Path, crf: str, swing: float, preset: str) -> None:
+    """A beam of dots that swings by up to 20 px, coded finely or so coarsely that most motion is passed over."""
     size, frames = (416, 320), 40
     column, row = np.meshgrid(np.arange(60, 400, 56.0), np.arange(60, 260, 50.0))
     rest = np.stack([column.ravel(), row.ravel()], axis=1)
@@ -103,7 +113,7 @@ def test_sigma_knows_of_compression(tmp_path: Path, crf: str, swing: float) -> N
     with av.open(str(path), "w") as output:
         stream = output.add_stream("libx264", rate=100)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        stream.options = {"crf": crf}
+        stream.options = {"crf": crf, "preset": preset}
         for number in range(frames):
             dots = [(x, y, 8.0, 8.0, 0.0) for x, y in place[number]]
             frame = av.VideoFrame.from_ndarray(picture(dots, size, noise=3.0, seed=number), format="gray")

@@ -309,7 +309,10 @@ def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path) -> None:
 
 
 def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
-    """H.264 whose macroblocks differ; at a fixed quantiser of 30, whose step is 20 levels; other codecs say none."""
+    """H.264 whose macroblocks differ; at a fixed quantiser of 30, whose step is 20 levels; other codecs say none.
+
+    An encoder in a hurry counts as a coarser one.
+    """
     path = tmp_path / "a.mp4"
     write_video(path, "libx264", "yuv420p", options={"crf": "25", "aq-mode": "1", "aq-strength": "2"})
     plain = [frame.steps for frame in open_video(path).read()]
@@ -329,6 +332,9 @@ def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
     write_video(path, "libx264", "yuv420p", options={"qp": "30", "bf": "0"})
     later = list(open_video(path).read())[7]
     np.testing.assert_allclose(later.steps, 20.0)
+    for preset, coarser in (("ultrafast", 2.2), ("veryfast", 2.2), ("faster", 1.4), ("medium", 1.0), ("slow", 1.0)):
+        write_video(path, "libx264", "yuv420p", options={"qp": "30", "bf": "0", "preset": preset})
+        np.testing.assert_allclose(list(open_video(path).read())[7].steps, coarser * 20.0)
     write_video(path.with_suffix(".avi"), "mjpeg", "yuvj420p")
     frame = next(iter(open_video(path.with_suffix(".avi")).read()))
     assert frame.steps is None
