@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from tracking.disc import PARAMETERS, SCRATCH
 from tracking.fit import QUALITY, fit_disc
@@ -243,4 +244,8 @@ def find_spots(image: NDArray, radius: float, contrast: float, region: tuple[int
     peaks = (cv2.dilate(response, np.ones((inner, inner))) == response) & (response > SPOT_SHARE * abs(contrast))
     rows, columns = np.divmod(np.flatnonzero(peaks), width)  # np.nonzero takes ten times as long
     centre = (shrink - 1) / 2.0
-    return np.stack([columns * shrink + centre + left, rows * shrink + centre + top], axis=1)
+    spots = np.stack([columns * shrink + centre + left, rows * shrink + centre + top], axis=1)
+    # A flat top has several peaks; taken for two dots, each would be fitted without the pixels of the other.
+    one, other = cKDTree(spots).query_pairs(radius, output_type="ndarray").reshape(-1, 2).T
+    strength = response[rows, columns]
+    return np.delete(spots, np.where(strength[one] < strength[other], one, other), axis=0)

@@ -3,7 +3,7 @@ import pytest
 from support import picture
 
 from tracking.artificial import Scene, draw, expose
-from tracking.dots import Dots, find_dots
+from tracking.dots import Dots, find_dots, find_spots
 
 
 def nearest(dots: Dots, truth: tuple[float, float]) -> int:
@@ -73,6 +73,17 @@ def test_neighbours_do_not_pull() -> None:
     dots = find_dots(picture(truth), True)
     for x, y, *_ in truth:
         assert dots.centre[nearest(dots, (x, y))] == pytest.approx((x, y), abs=0.03)
+
+
+@pytest.mark.parametrize("radius", [4.0, 8.0, 15.0, 24.0])
+def test_a_dot_is_one_spot(radius: float) -> None:
+    """Wherever it lies between the pixels of the shrunken picture, in which two of them may be equally dark."""
+    for shift in np.arange(0.0, 8.0, 0.5):
+        truth = [(80.0 + shift, 80.0, radius, radius, 0.0), (80.0 + shift + 2.2 * radius, 80.0, radius, radius, 0.0)]
+        spots = find_spots(picture(truth), radius, -130.0, (0, 0, 200, 160))
+        assert len(spots) == 2
+        for x, y, *_ in truth:
+            assert np.linalg.norm(spots - (x, y), axis=1).min() < 0.7 * radius
 
 
 def test_nothing_in_an_empty_picture() -> None:
