@@ -221,7 +221,7 @@ def apart(dots: Dots, nearest: float) -> Dots:
 
 
 def find_spots(image: NDArray, radius: float, contrast: float, region: tuple[int, int, int, int]) -> Array:
-    """Where dots of a known radius and contrast may be, quickly, to a pixel or so, (D, 2).
+    """Where dots of a known radius and contrast may be, quickly, to half a radius or so, (D, 2).
 
     Args:
         image: grey levels.
