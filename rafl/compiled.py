@@ -19,7 +19,7 @@ from rafl.solvers import linear_solver
 
 Array = NDArray[Any]
 
-CELLS_FOR_TWO = 120  # in a batch, below which one thread is as fast as two
+CELLS_FOR_TWO = 60  # in a batch, below which one thread is as fast as two
 
 
 class Compiled:

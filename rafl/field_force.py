@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numba import njit
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -58,6 +59,15 @@ def accelerations(inputs: Tensor, weights: Sequence[Tensor]) -> list[Tensor]:
     return [*layers, weights[-1] @ layers[-1]]
 
 
+@njit(cache=True, error_model="numpy")
+def by_elu(derivatives, values):  # type: ignore[no-untyped-def]
+    """Multiply derivatives by ELU's values (W, P) with its slopes: one where a value is positive, else value + 1."""
+    by, value = derivatives.ravel(), values.ravel()
+    none, one = by.dtype.type(0.0), by.dtype.type(1.0)
+    for k in range(len(by)):
+        by[k] *= min(value[k], none) + one
+
+
 class FieldForce(torch.autograd.Function):
     """Nodal forces (B, N, 3) [N] of states q, v (B, N, 3) under a network's weights, the features' scale in the first.
 
@@ -89,7 +99,7 @@ class FieldForce(torch.autograd.Function):
             by_weights.insert(0, by_layer @ layers[k].T)
             by_layer = weights[k].T @ by_layer
             if k > 0:
-                by_layer *= layers[k].clamp(max=0.0).add_(1.0)  # slope of ELU, from its value
+                by_elu(by_layer.numpy(), layers[k].numpy())
         by_q, by_v = np.empty(grad.shape), np.empty(grad.shape)
         if ctx.needs_input_grad[0] or ctx.needs_input_grad[1]:
             by_inputs = np.ascontiguousarray(by_layer.double().numpy())

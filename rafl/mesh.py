@@ -142,7 +142,11 @@ class HexMesh:
 
     def stretching_at_most(self, farthest: NDArray[np.float64]) -> NDArray[np.float64]:
         """What no displacement stretches more than whose components are at most `farthest` [m], (B), sooner found."""
-        return 2.0 * math.sqrt(3.0) * farthest / float(self.edge_lengths.min())
+        return 2.0 * math.sqrt(3.0) * farthest / self._shortest_edge
+
+    @cached_property
+    def _shortest_edge(self) -> float:
+        return float(self.edge_lengths.min())
 
     def mirrors(self, held: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Whether the plane across each axis (3), through the middle, maps the cells and the vertices `held` onto

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.descent import begin, judge, moved
 from rafl.engine import Engine
 from rafl.errors import SimulationError
 from rafl.linear import Factors
@@ -77,72 +78,49 @@ def _descend(
     """`minimise` with steps that change no edge by more than `longest` times its length."""
     batch, shape = len(start), start.shape[1:]
     free = engine.free_index
-    diagonal = np.repeat(inertia, 3, axis=1)[:, free]
-    wanted, load = target.reshape(batch, -1)[:, free], force.reshape(batch, -1)[:, free]
+    diagonal = np.take(np.repeat(inertia, 3, axis=1), free, axis=1)
+    pulls = (free, diagonal, *(np.take(x.reshape(batch, -1), free, axis=1) for x in (target, force)))
     q = start.reshape(batch, -1).copy()
-
-    def objective(rows: Array, at: Array) -> tuple[Array, Array, Array]:
-        """Energy, the size of its parts, and the residual (R, n) of positions (R, 3 N)."""
-        whole = len(rows) == batch
-        some = slice(None) if whole else rows
-        resisting = resistance if whole else resistance.rows(rows)
-        elastic, gradient, _ = engine.terms(at.reshape(-1, *shape), resisting, tangent=False)
-        x, pushed = at[:, free], load[some]
-        gap = x - wanted[some]
-        pull = diagonal[some] * gap
-        inertial, work = 0.5 * _dot(pull, gap), _dot(pushed, x)
-        residual = gradient.reshape(len(rows), -1)[:, free] + pull - pushed
-        return elastic + inertial - work, np.abs(elastic) + inertial + np.abs(work), residual
-
     stiffest = engine.integration.stiffest(resistance.moduli)
     reach = ROUNDING * np.abs(q).max(axis=1)  # what rounding does to positions [m]
-    energy, _, residual = objective(np.arange(batch), q)
-    largest = np.abs(residual).max(axis=1)
     enough = np.maximum(TOLERANCE, stiffest * reach)
+    energy, largest, residual = np.empty(batch), np.empty(batch), np.empty_like(diagonal)
+
+    def elastic(rows: Array, at: Array) -> tuple[Array, Array]:
+        """Elastic energy (P) and its derivative (P, N, 3) of positions (P, 3 N)."""
+        resisting = resistance if len(rows) == batch else resistance.rows(rows)
+        return engine.terms(at.reshape(-1, *shape), resisting, tangent=False)[:2]
+
+    begin(q, *elastic(np.arange(batch), q), *pulls, energy, residual, largest)
     for _ in range(MAX_ITERATIONS):
         running = np.flatnonzero(~(largest <= enough))
         if not len(running):
             return q.reshape(start.shape)
         if not np.isfinite(largest[running]).all():
             break
-        stale = factors.ready[running]
-        new = running[~stale]
+        old = factors.ready[running]
+        new = running[~old]
         if len(new):
             at = q[new].reshape(-1, *shape)
             _factor(engine, at, resistance.rows(new), factors, new, diagonal[new], what, largest[new])
-        step = -engine.solve(factors, running, residual[running][:, None])[:, 0]
-        slope = _dot(step, residual[running])
+        down = residual[running]
+        step = -engine.solve(factors, running, down[:, None])[:, 0]
+        slope = np.einsum("ij,ij->i", step, down)
         length = np.ones(len(running))
         far = np.flatnonzero(engine.mesh.stretching_at_most(np.abs(step).max(axis=1)) > longest)
         if len(far):
             change = engine.mesh.stretching(_scattered(step[far], free, q.shape[1]))
             length[far] = np.minimum(1.0, longest / np.maximum(change, 1e-300))
-        pending = np.arange(len(running))
         for _ in range(40):
-            rows = running[pending]
-            trial = q[rows]
-            trial[:, free] += length[pending, None] * step[pending]
-            e, parts, r = objective(rows, trial)
-            size = np.abs(r).max(axis=1)
-            # Close to the minimum energies differ by rounding only: the residual decides there.
-            slack = 1e-13 * parts + 10.0 * reach[rows] * np.sqrt(stiffest[rows] * parts)
-            level = e <= energy[rows] + slack
-            old = stale[pending]
-            accepted = np.where(
-                old,
-                level & (size <= 0.5 * largest[rows]),
-                (e <= energy[rows] + 1e-4 * length[pending] * slope[pending]) | (level & (size < largest[rows])),
-            )
-            good = rows[accepted]
-            factors.ready[good] = _worth_keeping(size[accepted] / largest[good], size[accepted] / enough[good], engine)
-            q[good], energy[good] = trial[accepted], e[accepted]
-            residual[good], largest[good] = r[accepted], size[accepted]
-            factors.ready[rows[old & ~accepted]] = False
-            pending = pending[~accepted & ~old]
-            if not len(pending):
+            trial = moved(q, running, free, step, length)
+            again = judge(
+                trial, *elastic(running, trial), running, old, length, slope, *pulls, stiffest, reach, enough,
+                engine.patience, q, energy, residual, largest, factors.ready,
+            )  # fmt: skip
+            if not again.any():
                 break
-            length[pending] *= 0.5
-        if len(pending):
+            running, old, step, slope, length = (x[again] for x in (running, old, step, slope, 0.5 * length))
+        else:
             break
     open_ = np.flatnonzero(~(largest <= enough))
     if not len(open_):
@@ -159,19 +137,6 @@ def _scattered(step: Array, free: Array, unknowns: int) -> Array:
     full = np.zeros((len(step), unknowns))
     full[:, free] = step
     return full.reshape(len(step), -1, 3)
-
-
-def _dot(a: Array, b: Array) -> Array:
-    """Row by row, (R)."""
-    return np.einsum("ij,ij->i", a, b)
-
-
-def _worth_keeping(shrinking: Array, left: Array, engine: Engine) -> NDArray[np.bool_]:
-    """Whether at this pace the rest takes fewer steps than a new factor costs.
-
-    shrinking: of the residual in the last step, (R); left: residual over what is wanted, (R).
-    """
-    return np.log(np.maximum(left, 1.0)) <= -engine.patience * np.log(shrinking.clip(1e-300, 1.0))
 
 
 def _factor(

@@ -118,12 +118,14 @@ def rollout(
     fixed = torch.from_numpy(simulator.fixed)
     state = State(start.q, start.v, torch.zeros_like(start.q))
     positions, forces = [start.q], []
+    begin = start.q[:, fixed]
     for step in range(steps):
         force = external
         if residual is not None:
             forces.append(residual(state.q, state.v, external))
             force = external + forces[-1]
-        begin = state.q[:, fixed]
+        if clamp is not None:
+            begin = state.q[:, fixed]
         if step == 0 and integrator.uses_acceleration:
             share = FIRST_SHARE / simulator.substeps
             held = begin if clamp is None else (1.0 - share) * begin + share * clamp[0]
