@@ -170,18 +170,17 @@ def candidates(image: NDArray, dark: bool) -> Array:
 
 
 def _blobs(image: NDArray[np.uint8], mask: NDArray[np.uint8], scale: float) -> list[Array]:
-    _, labels, stats, centroids = cv2.connectedComponentsWithStats(mask, connectivity=4)
+    count, labels = cv2.connectedComponents(mask, connectivity=4)
+    box, area, centroids = _extents(labels, count)
     low, high = max(RADII[0], 0.6 * scale) - 1.0, min(RADII[1], 1.7 * scale) + 1.0
-    area = stats[:, cv2.CC_STAT_AREA]
-    width, height = stats[:, cv2.CC_STAT_WIDTH], stats[:, cv2.CC_STAT_HEIGHT]
+    width, height = (box[:, 2:] - box[:, :2]).T
     chosen = (area > np.pi * low**2 * FLATTEST) & (area < np.pi * high**2)
     chosen &= (np.maximum(width, height) < 2.3 * high) & (np.minimum(width, height) > 2 * low * FLATTEST)
     chosen &= area > 0.55 * width * height
-    chosen[0] = False
     starts = []
     for label in np.flatnonzero(chosen):
-        x, y, w, h = stats[label, :4]
-        own = labels[y : y + h, x : x + w] == label
+        x, y, right, bottom = box[label]
+        own = labels[y:bottom, x:right] == label
         rows, columns = np.nonzero(own)
         cx, cy = centroids[label]
         dx, dy = columns + x - cx, rows + y - cy
@@ -192,12 +191,34 @@ def _blobs(image: NDArray[np.uint8], mask: NDArray[np.uint8], scale: float) -> l
             continue
         outline = vectors @ np.diag(0.5 / np.sqrt(values)) @ vectors.T
         pad = 3
-        around = image[max(y - pad, 0) : y + h + pad, max(x - pad, 0) : x + w + pad]
-        inside = float(np.median(image[y : y + h, x : x + w][own]))
+        around = image[max(y - pad, 0) : bottom + pad, max(x - pad, 0) : right + pad]
+        inside = float(np.median(image[y:bottom, x:right][own]))
         edge = np.concatenate([around[0], around[-1], around[:, 0], around[:, -1]])
         level = float(np.median(edge))
         starts.append(start_of(cx, cy, outline[[0, 0, 1], [0, 1, 1]], inside - level, level))
     return starts
+
+
+@njit(cache=True, nogil=True)
+def _extents(labels, count):  # type: ignore[no-untyped-def]
+    """Left, top and first pixel beyond right and bottom (L, 4), area (L) and centroid (L, 2) of what is labelled.
+
+    OpenCV's own take seven times as long. Label 0, the ground, is left out.
+    """
+    height, width = labels.shape
+    box, area = np.zeros((count, 4), np.int64), np.zeros(count, np.int64)
+    box[:, 0], box[:, 1] = width, height
+    centroid = np.zeros((count, 2))
+    for y in range(height):
+        for x in range(width):
+            label = labels[y, x]
+            if label:
+                area[label] += 1
+                centroid[label, 0] += x
+                centroid[label, 1] += y
+                box[label, 0], box[label, 2] = min(box[label, 0], x), max(box[label, 2], x + 1)
+                box[label, 1], box[label, 3] = min(box[label, 1], y), y + 1
+    return box, area, centroid / np.maximum(area, 1).reshape(-1, 1)
 
 
 def find_dots(image: NDArray, dark: bool) -> Dots:
@@ -240,8 +261,10 @@ def find_spots(image: NDArray, radius: float, contrast: float, region: tuple[int
     signed = small if contrast > 0 else 255 - small
     inner, outer = (int(factor * radius / shrink) | 1 for factor in (1.3, 4.5))
     level = cv2.boxFilter(signed, cv2.CV_32F, (outer, outer), borderType=cv2.BORDER_REFLECT)
-    response = cv2.boxFilter(signed, cv2.CV_32F, (inner, inner), borderType=cv2.BORDER_REFLECT) - level
-    peaks = (cv2.dilate(response, np.ones((inner, inner))) == response) & (response > SPOT_SHARE * abs(contrast))
+    response = cv2.boxFilter(signed, cv2.CV_32F, (inner, inner), borderType=cv2.BORDER_REFLECT)
+    response = cv2.subtract(response, level, dst=response)  # in place: fresh memory takes longer than the sums
+    highest = cv2.dilate(response, np.ones((inner, inner)), dst=level)
+    peaks = (highest == response) & (response > SPOT_SHARE * abs(contrast))
     rows, columns = np.divmod(np.flatnonzero(peaks), width)  # np.nonzero takes ten times as long
     centre = (shrink - 1) / 2.0
     spots = np.stack([columns * shrink + centre + left, rows * shrink + centre + top], axis=1)

@@ -236,10 +236,10 @@ class Tracker:
 
     def _expected(self) -> Array:
         """Where the motion so far puts the markers; those out of sight where the others carry them."""
+        if not self.missing.any():
+            return self.motion.expected()
         seen = self.missing == 0
-        if not seen.any():
-            return self.motion.last
-        return self.memory.carried(self.motion.expected(), seen)
+        return self.memory.carried(self.motion.expected(), seen) if seen.any() else self.motion.last
 
     def _where_expected(self, image: NDArray, expected: Array) -> Dots | None:
         """The dots at the markers' expected places; None where they are not all their own."""
@@ -285,6 +285,8 @@ class Tracker:
         far from there as from where they put another marker out of sight, one by one, each a help for the next.
         """
         shown = np.isfinite(dots.sigma[:, 0])
+        if not self.missing.any():
+            return shown
         sure = shown & (self.missing == self.missing.min())
         while sure.any() and (shown & ~sure).any():
             place = self.memory.carried(dots.centre, sure)
@@ -342,4 +344,6 @@ def _own(centre, contrast, expected, before, missing, spacing, same, good):  # t
 
 def _only(dots: Dots, good: NDArray[np.bool_]) -> Dots:
     """The same dots, the others' sigma NaN."""
+    if good.all():
+        return dots
     return replace(dots, sigma=np.where(good[:, None], dots.sigma, np.nan))
