@@ -41,7 +41,9 @@ COARSER = ((2, 2.2), (6, 1.4))
 # Decoders that refuse what is damaged, and need not be heard: this one writes dozens of lines a frame into its log, for
 # each of which PyAV waits for Python's lock, though nobody is to see them.
 OPEN = {"mjpeg"}
-MOST_DECODERS = 4  # side by side, of videos each of whose pictures stands for itself
+# Decoders side by side, of videos each of whose pictures stands for itself: one more for so many bytes a picture, which
+# take about as long as following the dots in it. More than it needs would only keep the follower from its work.
+MOST_DECODERS, BYTES_EACH = 4, 40_000
 _heard: list[str] = []  # the decoders at work that must be heard; the log is one for the whole program
 DEEPEST = 32  # frames that may be shown before one that they refer to: H.264 and HEVC allow 16
 
@@ -66,7 +68,7 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
             container = stack.enter_context(av.open(str(path)))
             codec = container.streams.video[0].codec_context.codec
             stack.enter_context(_log_of(codec.name))
-            count = min(MOST_DECODERS, os.cpu_count() or 1) if codec.intra_only else 1
+            count = min(MOST_DECODERS, os.cpu_count() or 1, _decoders_worth(path)) if codec.intra_only else 1
             containers = [container, *(stack.enter_context(av.open(str(path))) for _ in range(1, count))]
             decoders = [_strict(item.streams.video[0]) for item in containers]
             for frame in stack.enter_context(closing(_frames(container, decoders, notes))):
@@ -81,6 +83,13 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
     if not shown:
         raise InputError(f"expected frames in {path}, found none; copy the video again from the camera")
     notes += _contradictions(path.name, frames, fps, np.array(shown))
+
+
+def _decoders_worth(path: Path) -> int:
+    """How many decoders keep pace with following the dots, by the size of a video's first packet."""
+    with av.open(str(path)) as container:
+        first = next(_packets(container, container.streams.video[0], []), None)
+        return 1 + (0 if first is None else first.size // BYTES_EACH)
 
 
 @contextmanager
@@ -111,6 +120,7 @@ def _frames(
     stream = container.streams.video[0]
     assert stream.time_base is not None
     tells = stream.codec_context.name == "h264"
+    alone = stream.codec_context.codec.intra_only
     order = _Order(float(stream.time_base))
     number = 0
     coarser = 0.0  # not known yet
@@ -123,15 +133,15 @@ def _frames(
             order.spoil(packet.pts)
         while frames:
             frame = frames.pop(0)
-            stamp, picture = frame.pts, None if frame.is_corrupt else _grey(frame)
-            if shape is None and picture is not None:
-                shape = picture.shape
+            asked = tells and number % ASKED == 0
+            # A decoder that needs no earlier pictures works the quicker the sooner it has its memory back.
+            stamp, picture = frame.pts, None if frame.is_corrupt else _grey(frame, copy=alone or asked)
+            shape = picture.shape if shape is None and picture is not None else shape
             if picture is None or picture.shape != shape:  # damage may turn pictures, too
                 order.spoil(stamp)
-            steps = None
-            if tells and number % ASKED == 0 and picture is not None:
-                steps, picture = _steps(frame, coarser), picture.copy()
-                del frame
+            steps = _steps(frame, coarser) if asked and picture is not None else None
+            del frame
+            if asked:
                 gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
             yield from order.shown(_Decoded(stamp, picture, steps))
             number += 1
@@ -335,20 +345,20 @@ def quarter_turns(frame: "av.VideoFrame") -> int:
     return round(frame.rotation / 90.0) % 4
 
 
-def _grey(frame: "av.VideoFrame") -> NDArray:
+def _grey(frame: "av.VideoFrame", copy: bool) -> NDArray:
     """The luma plane as it is stored, or the grey of a format without one, turned as it is to be shown.
 
-    It lies in the decoder's own memory where it can: a copy takes a tenth of the time of decoding.
+    Without `copy` it lies in the decoder's own memory where it can, which takes a tenth of the time of decoding less.
     """
     name, bits = frame.format.name, frame.format.components[0].bits
     planar = name.startswith(("yuv4", "yuvj4", "gray", "nv1", "nv2", "p01", "p21", "yuva4")) and not name.endswith("be")
     if planar and bits <= 16 and not name.startswith("grayf"):
         plane = frame.planes[0]
-        kind = np.uint8 if bits == 8 else np.uint16
-        rows = np.frombuffer(plane, kind).reshape(plane.height, -1)[:, : plane.width]
+        rows = np.frombuffer(plane, np.uint8 if bits == 8 else np.uint16).reshape(plane.height, -1)[:, : plane.width]
         # p010 and its like keep their bits at the upper end.
         high = name.startswith(("p01", "p21"))
-        picture = np.ascontiguousarray(rows) if bits == 8 else scaled(rows, 16 if high else bits)
+        whole = np.array if copy else np.ascontiguousarray
+        picture = whole(rows) if bits == 8 else scaled(rows, 16 if high else bits)
     elif bits > 8:
         picture = scaled(frame.to_ndarray(format="gray16le"), 16)
     else:
@@ -379,7 +389,7 @@ def _steps(frame: "av.VideoFrame", coarser: float) -> NDArray | None:
         if kind != H264_PARAMETERS or count != rows * columns or size % 4:
             continue
         blocks = np.frombuffer(data, np.int32, count * size // 4, offset).reshape(rows, columns, -1)
-        steps = coarser * STEPS[np.clip(quantiser + blocks[..., 4], -64, 127) + 64]
+        steps = np.take(coarser * STEPS, blocks[..., 4] + (quantiser + 64), mode="clip")
         if turns := quarter_turns(frame):
             whole = np.kron(steps, np.ones((MACROBLOCK, MACROBLOCK)))[: frame.height, : frame.width]
             half = MACROBLOCK // 2

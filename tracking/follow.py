@@ -160,8 +160,10 @@ class _Album:
 
     def consider(self, number: int, picture: NDArray, sigma: Array) -> None:
         """Keeps a picture if it is among the worst so far."""
-        located = sigma[sigma == sigma]  # not NaN
-        badness = len(sigma) - 0.5 * len(located) + float(located.max(initial=0.0))
+        badness = float(sigma.max(initial=0.0))
+        if badness != badness:  # some are not seen
+            located = sigma[sigma == sigma]
+            badness = len(sigma) - 0.5 * len(located) + float(located.max(initial=0.0))
         if self.first is not None and len(self.worst) == WORST and badness <= self.worst[0][0]:
             return
         if self.first is None:
@@ -199,9 +201,8 @@ class Tracker:
         dots = None
         if self.motion.surprise.min() < CALM:
             dots = self._where_expected(image, expected)
-        wanted = self.missing == 0
         self.searched += 1
-        if dots is None or np.isnan(dots.sigma[wanted]).any() or not wanted.any() or self.searched >= self._patience():
+        if dots is None or not self._holds(dots) or self.searched >= self._patience():
             found = self._search(image, expected)
             better = dots is None or np.isfinite(found.sigma[:, 0]).sum() > np.isfinite(dots.sigma[:, 0]).sum()
             dots = found if better or dots is None else dots
@@ -231,8 +232,15 @@ class Tracker:
             self.missing = np.append(self.missing, 0 if number in newcomer.seen else 1)
         return found
 
+    def _holds(self, dots: Dots) -> bool:
+        """Whether all markers that were in sight are among the dots, and some were."""
+        if not self.missing.any():
+            return not np.isnan(dots.sigma).any()
+        wanted = self.missing == 0
+        return bool(wanted.any()) and not np.isnan(dots.sigma[wanted]).any()
+
     def _patience(self) -> float:
-        return RECHECK if (self.missing > 0).any() else np.inf
+        return RECHECK if self.missing.any() else np.inf
 
     def _expected(self) -> Array:
         """Where the motion so far puts the markers; those out of sight where the others carry them."""
@@ -301,17 +309,20 @@ class Tracker:
         return shown
 
     def _learn(self, dots: Dots) -> None:
-        seen = np.isfinite(dots.sigma[:, 0])
-        was = self.missing == 0
-        self.motion.judge(dots.centre, seen & was, self.pattern.spacing)
-        place = dots.centre
-        if not seen.all():
+        seen, place = np.isfinite(dots.sigma[:, 0]), dots.centre
+        whole = bool(seen.all())
+        self.motion.judge(place, seen & (self.missing == 0), self.pattern.spacing)
+        if not whole:
             place = np.where(seen[:, None], place, self._expected())
             place = self.memory.carried(place, seen)
         self.memory.add(place, seen)
         self.motion.remember(place)
-        self.missing = np.where(seen, 0, self.missing + 1)
-        self.parameters[seen] = dots.parameters[seen]
+        if whole:
+            self.missing[:] = 0
+            self.parameters[:] = dots.parameters
+        else:
+            self.missing = np.where(seen, 0, self.missing + 1)
+            self.parameters[seen] = dots.parameters[seen]
 
 
 @njit(cache=True)

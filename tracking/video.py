@@ -20,7 +20,7 @@ VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 # Pictures decoded before they are asked for, as the first takes its time: how many handfuls of how many bytes. Two
 # threads that wait for each other at every picture lose a twentieth of their time.
-HANDFULS, HANDFUL = 6, 2**23
+HANDFULS, HANDFUL = 12, 2**22
 SMALL = 2**20  # bytes that a lost picture counts for
 
 
