@@ -195,9 +195,10 @@ def test_decoders_side_by_side_give_what_one_gives(
     content[start + len(packet) // 4 : start + len(packet)] = bytes(len(packet) - len(packet) // 4)
     path.write_bytes(content)
     found = []
+    monkeypatch.setattr("tracking.decoding.BYTES_EACH", 100)
+    monkeypatch.setattr("os.cpu_count", lambda: 8)
     for most in (1, 4):
         monkeypatch.setattr("tracking.decoding.MOST_DECODERS", most)
-        monkeypatch.setattr("os.cpu_count", lambda: 8)
         found.append(list(open_video(path).read()))
     assert [k for k, frame in enumerate(found[1]) if frame.picture is None] == [12]
     for one, other in zip(*found, strict=True):
@@ -205,8 +206,32 @@ def test_decoders_side_by_side_give_what_one_gives(
         np.testing.assert_array_equal(one.picture, other.picture)
 
 
-def test_reading_can_stop_while_decoders_are_at_work(tmp_path: Path) -> None:
+def test_small_pictures_have_one_decoder_and_large_ones_several(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As many as keep pace with the follower, and no more than four."""
+    monkeypatch.setattr("os.cpu_count", lambda: 8)
+    random = np.random.default_rng(4)
+    many = {}
+    for side in (64, 800):
+        pictures = [random.integers(0, 256, (side, side)).astype(np.uint8)] * 6
+        write_video(tmp_path / f"{side}.avi", "mjpeg", "yuvj420p", pictures=pictures)
+        used: set[int] = set()
+
+        def decoded(packet: av.Packet, decoder: av.CodecContext, used: set[int] = used) -> object:
+            used.add(id(decoder))
+            return [], False
+
+        monkeypatch.setattr("tracking.decoding._decoded", decoded)
+        assert len(list(frames_of_file(tmp_path / f"{side}.avi", 0, 0.0, []))) == 6
+        many[side] = len(used)
+    assert many == {64: 1, 800: 4}
+
+
+def test_reading_can_stop_while_decoders_are_at_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_video(tmp_path / "a.avi", "mjpeg", "yuvj420p")
+    monkeypatch.setattr("tracking.decoding.BYTES_EACH", 100)
+    monkeypatch.setattr("os.cpu_count", lambda: 4)
     running = threading.active_count()
     reading = frames_of_file(tmp_path / "a.avi", 0, 0.0, [])
     next(reading)
