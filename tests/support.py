@@ -8,11 +8,14 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
+import av
 import cv2
 import numpy as np
 
 ROOT = Path(__file__).parent.parent
 SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared")).resolve()
+
+FRAMES = 12  # of a ramp's video
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
@@ -64,3 +67,26 @@ def zero_crossing_frequency(z: np.ndarray, time_step: float) -> float:
     before = np.flatnonzero((z[:-1] < 0) & (z[1:] >= 0))
     times = time_step * (before + z[before] / (z[before] - z[before + 1]))
     return (len(times) - 1) / (times[-1] - times[0])
+
+
+def ramp(frame: int) -> np.ndarray:
+    """A smooth picture, another each frame, within the range every format keeps."""
+    x, y = np.meshgrid(np.arange(96), np.arange(64))
+    return (30 + x + 1.2 * y + 5 * frame).astype(np.uint8)
+
+
+def write_video(
+    path: Path, codec: str, pixels: str, rate: int = 100, options: dict[str, str] | None = None,
+    pictures: list[np.ndarray] | None = None,
+) -> None:  # fmt: skip
+    """Of pictures (H, W), or of ramps that grow lighter."""
+    pictures = pictures or [ramp(number) for number in range(FRAMES)]
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream(codec, rate=rate)
+        stream.height, stream.width = pictures[0].shape
+        stream.pix_fmt = pixels
+        stream.options = options or {}
+        for picture in pictures:
+            frame = av.VideoFrame.from_ndarray(picture, format="gray")
+            output.mux(stream.encode(frame.reformat(format=pixels)))
+        output.mux(stream.encode())

@@ -234,8 +234,6 @@ class Tracker:
 
     def _holds(self, dots: Dots) -> bool:
         """Whether all markers that were in sight are among the dots, and some were."""
-        if not self.missing.any():
-            return not np.isnan(dots.sigma).any()
         wanted = self.missing == 0
         return bool(wanted.any()) and not np.isnan(dots.sigma[wanted]).any()
 
@@ -310,19 +308,14 @@ class Tracker:
 
     def _learn(self, dots: Dots) -> None:
         seen, place = np.isfinite(dots.sigma[:, 0]), dots.centre
-        whole = bool(seen.all())
         self.motion.judge(place, seen & (self.missing == 0), self.pattern.spacing)
-        if not whole:
+        if not seen.all():
             place = np.where(seen[:, None], place, self._expected())
             place = self.memory.carried(place, seen)
         self.memory.add(place, seen)
         self.motion.remember(place)
-        if whole:
-            self.missing[:] = 0
-            self.parameters[:] = dots.parameters
-        else:
-            self.missing = np.where(seen, 0, self.missing + 1)
-            self.parameters[seen] = dots.parameters[seen]
+        self.missing = np.where(seen, 0, self.missing + 1)
+        self.parameters[seen] = dots.parameters[seen]
 
 
 @njit(cache=True)

@@ -9,43 +9,18 @@ import av
 import cv2
 import numpy as np
 import pytest
+from support import FRAMES, ramp, write_video
 
-from calibration.camera import OrthographicCamera
-from calibration.rig import Rig
 from groundwork import InputError
 from tracking.decoding import _Decoded, _Order, frames_of_file
-from tracking.recordings import find_recordings
 from tracking.video import open_video
 
-FRAMES = 12
 SAFE = {"libx264": {"g": "6"}, "ffv1": {"level": "3", "slicecrc": "1", "g": "6"}}  # short groups, checksums
 QUIET = {
     "libx264": {"crf": "4"},
     "libx265": {"crf": "4", "x265-params": "log-level=none"},
     "libsvtav1": {"crf": "10", "preset": "10"},
 }
-
-
-def ramp(frame: int) -> np.ndarray:
-    """A smooth picture, another each frame, within the range every format keeps."""
-    x, y = np.meshgrid(np.arange(96), np.arange(64))
-    return (30 + x + 1.2 * y + 5 * frame).astype(np.uint8)
-
-
-def write_video(
-    path: Path, codec: str, pixels: str, rate: int = 100, options: dict[str, str] | None = None,
-    pictures: list[np.ndarray] | None = None,
-) -> None:  # fmt: skip
-    pictures = pictures or [ramp(number) for number in range(FRAMES)]
-    with av.open(str(path), "w") as output:
-        stream = output.add_stream(codec, rate=rate)
-        stream.height, stream.width = pictures[0].shape
-        stream.pix_fmt = pixels
-        stream.options = options or {}
-        for picture in pictures:
-            frame = av.VideoFrame.from_ndarray(picture, format="gray")
-            output.mux(stream.encode(frame.reformat(format=pixels)))
-        output.mux(stream.encode())
 
 
 @pytest.mark.parametrize(
@@ -383,23 +358,3 @@ def test_a_reader_that_stops_early_leaves_no_thread(tmp_path: Path) -> None:
     next(frames)
     frames.close()  # type: ignore[attr-defined]
     assert threading.active_count() == before
-
-
-def camera() -> OrthographicCamera:
-    return OrthographicCamera(image_size=(96, 64), scale=(1e4, 1e4), rotation_vector=(0.0, 0.0, 0.0))
-
-
-def test_recordings_are_found_by_name(tmp_path: Path) -> None:
-    rig = Rig({"left": camera(), "right": camera()})
-    (tmp_path / "one").mkdir()
-    for name in ("one/left.mkv", "one/right.mkv", "two_left.mkv", "two_right.mkv"):
-        write_video(tmp_path / name, "ffv1", "gray")
-    (tmp_path / "notes.txt").write_text("not a video")
-    found = find_recordings(tmp_path, rig, Path("calib.yaml"))
-    assert {name: sorted(cameras) for name, cameras in found.items()} == {
-        "one": ["left", "right"],
-        "two": ["left", "right"],
-    }
-    single = Rig({"front": camera()})
-    write_video(tmp_path / "swing.mkv", "ffv1", "gray")
-    assert set(find_recordings(tmp_path / "swing.mkv", single, Path("calib.yaml"))) == {"swing"}
