@@ -19,6 +19,7 @@ PARAMETERS = 12  # centre (2), A (3: xx, xy, yy), W (3: xx, xy, yy) [px^2], cont
 LARGEST = 8192  # pixels a fit looks at
 LINE = 64  # pixels that memory gives at a time
 CHUNK = 256  # pixels whose derivatives are held at a time, so that they stay in the nearest cache
+LANES = 32  # pixels that vector instructions take at a time; a fit's last ones are filled up by some of no weight
 
 # Rows of a fit's scratch, one array: so the compiler sees that no two of them overlap.
 X, Y, VALUE, WEIGHT, RESIDUAL, SIZE = (LARGEST * row for row in range(6))
@@ -93,7 +94,15 @@ def choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
             w[Y + count] = row - y0
             w[VALUE + count] = image[row, column]
             count += 1 - skipped  # no branch: where the pattern ends is nothing that a processor can foresee
+    for k in range(count, filled_up(count)):
+        w[X + k] = w[Y + k] = w[VALUE + k] = w[WEIGHT + k] = np.float32(0.0)
     return count
+
+
+@njit(**FAST)
+def filled_up(count):  # type: ignore[no-untyped-def]
+    """So many pixels and those that fill them up to a multiple of `LANES`."""
+    return (count + LANES - 1) // LANES * LANES
 
 
 @njit(**FAST)
@@ -127,10 +136,16 @@ def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-d
         for k in range(count):
             w[J + i * CHUNK + k] = np.float32(0.0)
     share = one / np.float32(instants)
+    # What p[5:8] mean is told by factors: a branch among the pixels would keep them from vector instructions.
+    round_ = np.float32(1.0 if smeared else 0.0)
+    once, twice = one - round_, np.float32(2.0) * (one - round_)
     for instant in range(instants):
         u = np.float32((instant + 0.5) / instants - 0.5)
+        way = u * round_
         mx = np.float32(fx + u * p[6]) if smeared else cx
         my = np.float32(fy + u * p[7]) if smeared else cy
+        # One short loop after another, by way of rows that the light's derivatives fill last: in one long loop every
+        # pixel would wait for the one before.
         for k in range(count):
             dx = w[X + first + k] - mx
             dy = w[Y + first + k] - my
@@ -138,16 +153,21 @@ def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-d
             ay = b * dx + c * dy
             square = ax * ax + ay * ay + tiny
             inverse_r = one / np.sqrt(square)
-            ax *= inverse_r
-            ay *= inverse_r
+            w[J + 9 * CHUNK + k] = ax * inverse_r
+            w[J + 10 * CHUNK + k] = ay * inverse_r
+            w[J + 11 * CHUNK + k] = one - square * inverse_r
+        for k in range(count):
+            ax = w[J + 9 * CHUNK + k]
+            ay = w[J + 10 * CHUNK + k]
             gx = a * ax + b * ay  # of r
             gy = b * ax + c * ay
-            xx = gx * gx
-            xy = gx * gy
-            yy = gy * gy
-            inverse_w = one / np.sqrt(w0 * xx + w1 * xy + w2 * yy + tiny)
-            z = (one - square * inverse_r) * inverse_w
-            z = min(max(z, np.float32(-4.0)), np.float32(4.0))
+            inverse_w = one / np.sqrt(w0 * gx * gx + w1 * gx * gy + w2 * gy * gy + tiny)
+            z = w[J + 11 * CHUNK + k] * inverse_w
+            w[J + 11 * CHUNK + k] = min(max(z, np.float32(-4.0)), np.float32(4.0))
+            w[J + 12 * CHUNK + k] = inverse_w
+        for k in range(count):
+            z = w[J + 11 * CHUNK + k]
+            inverse_w = w[J + 12 * CHUNK + k]
             t = z * z
             q = one - t * np.float32(1.0 / 16.0)
             q = q * q
@@ -161,7 +181,21 @@ def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-d
             step = np.float32(_S1) + t * step
             step = half + z * (np.float32(_S0) + t * step)
             by_r = -contrast * np.float32(_HEIGHT) * q * q * inverse_w
-            by_w = half * by_r * z * inverse_w
+            w[J + 8 * CHUNK + k] += share * step
+            w[J + 11 * CHUNK + k] = by_r
+            w[J + 12 * CHUNK + k] = half * by_r * z * inverse_w
+        for k in range(count):
+            dx = w[X + first + k] - mx
+            dy = w[Y + first + k] - my
+            ax = w[J + 9 * CHUNK + k]
+            ay = w[J + 10 * CHUNK + k]
+            by_r = w[J + 11 * CHUNK + k]
+            by_w = w[J + 12 * CHUNK + k]
+            gx = a * ax + b * ay
+            gy = b * ax + c * ay
+            xx = by_w * gx * gx
+            xy = by_w * gx * gy
+            yy = by_w * gy * gy
             ax *= by_r
             ay *= by_r
             gx *= by_r
@@ -171,15 +205,9 @@ def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-d
             w[J + 2 * CHUNK + k] += ax * dx
             w[J + 3 * CHUNK + k] += ax * dy + ay * dx
             w[J + 4 * CHUNK + k] += ay * dy
-            if smeared:
-                w[J + 5 * CHUNK + k] += by_w * (xx + yy)
-                w[J + 6 * CHUNK + k] -= u * gx
-                w[J + 7 * CHUNK + k] -= u * gy
-            else:
-                w[J + 5 * CHUNK + k] += by_w * xx
-                w[J + 6 * CHUNK + k] += np.float32(2.0) * by_w * xy
-                w[J + 7 * CHUNK + k] += by_w * yy
-            w[J + 8 * CHUNK + k] += share * step
+            w[J + 5 * CHUNK + k] += xx + round_ * yy
+            w[J + 6 * CHUNK + k] += twice * xy - way * gx
+            w[J + 7 * CHUNK + k] += once * yy - way * gy
     whole = np.float32(p[8])
     for k in range(count):
         dx = w[X + first + k] - cx

@@ -17,6 +17,7 @@ from tracking.disc import (
     X,
     Y,
     choose_pixels,
+    filled_up,
     linearise,
     smear,
 )
@@ -69,20 +70,14 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
     for axis in range(2):
         pull[axis, axis] = 1.0
         substitute(L, pull[axis])
-    reach = 0
-    for k in range(count):
-        reach = max(reach, abs(int(w[X + k])), abs(int(w[Y + k])))
-    side = 2 * reach // BLOCK + 2
-    for k in range(count):
-        row, column = (int(w[Y + k]) + reach) // BLOCK, (int(w[X + k]) + reach) // BLOCK
-        w[BLOCK_OF + k] = row * side + column
+    side = _number_blocks(count, w)
     blocks = np.zeros((2, side * side))
     white, doubted = np.zeros(2), np.zeros(2)
     score = np.zeros(n)
     squares = 0.0
     used = 0.0
     for first in range(0, count, CHUNK):
-        some = min(CHUNK, count - first)
+        some = filled_up(min(CHUNK, count - first))
         linearise(p, smeared, x0, y0, first, some, w)
         _add_influence(first, some, w, pull, white, blocks, doubted)
         squares_here, used_here = add_scores(first, some, w, score)
@@ -105,19 +100,37 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
 
 
 @njit(**FAST)
+def _number_blocks(count, w):  # type: ignore[no-untyped-def]
+    """Fills in which block of a square of them each pixel lies; returns how many blocks the square's side has."""
+    count = min(filled_up(count), LARGEST)
+    reach = np.float32(0.0)
+    for k in range(count):
+        away = max(abs(w[X + k]), abs(w[Y + k]))
+        reach = away if away > reach else reach
+    scale, side = np.float32(1.0 / BLOCK), 2 * int(reach) // BLOCK + 2
+    width = np.float32(side)
+    for k in range(count):
+        row, column = np.floor((w[Y + k] + reach) * scale), np.floor((w[X + k] + reach) * scale)
+        w[BLOCK_OF + k] = row * width + column
+    return side
+
+
+@njit(**FAST)
 def _add_influence(first, count, w, pull, white, blocks, doubted):  # type: ignore[no-untyped-def]
     """Each pixel's weight in the centre, squared, and times its residual, summed by block and over doubted ones."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
     for axis in range(2):
         influence = WEIGHTED + axis * CHUNK
-        for k in range(count):
-            w[influence + k] = np.float32(0.0)
-        for i in range(PARAMETERS):
-            factor = np.float32(pull[axis, i])
+        w[influence : influence + count] = np.float32(0.0)
+        for i in range(0, PARAMETERS, 4):  # four rows at once: what is filled is loaded and stored less often
             row = J + i * CHUNK
+            factor0, factor1 = np.float32(pull[axis, i]), np.float32(pull[axis, i + 1])
+            factor2, factor3 = np.float32(pull[axis, i + 2]), np.float32(pull[axis, i + 3])
             for k in range(count):
-                w[influence + k] += factor * w[row + k]
+                value0, value1 = w[row + k], w[row + CHUNK + k]
+                value2, value3 = w[row + 2 * CHUNK + k], w[row + 3 * CHUNK + k]
+                w[influence + k] += factor0 * value0 + factor1 * value1 + factor2 * value2 + factor3 * value3
         total = np.float32(0.0)
         pulled = np.float32(0.0)
         for k in range(count):
@@ -191,26 +204,35 @@ def _distrust(p, smeared, x0, y0, count, w, H):  # type: ignore[no-untyped-def]
     Otherwise a highlight beside the dot could pass for its blurred edge. Fills H as `normal_equations` does.
     """
     scale = np.float32(STRANGE * abs(p[8]))
-    strange = 0
+    strange = np.float32(0.0)
     w[WEIGHT : WEIGHT + count] = np.float32(1.0)
     H[:] = 0.0
     for first in range(0, count, CHUNK):
-        some = min(CHUNK, count - first)
+        some = filled_up(min(CHUNK, count - first))
         linearise(p, smeared, x0, y0, first, some, w)
-        for k in range(some):
-            weight = np.float32(1.0)
-            if abs(w[J + 8 * CHUNK + k] - np.float32(0.5)) > np.float32(0.4999):
-                z = w[J + 12 * CHUNK + k] / scale
-                weight = np.float32(1.0) / (np.float32(1.0) + z * z * z * z)
-            if weight < 0.3:
-                strange += 1
-            w[SIZE + first + k] = weight
+        strange += _weigh_levels(first, min(CHUNK, count - first), scale, w)
         add_products(first, some, w, H)
     if strange < 4:
         return False
     w[WEIGHT : WEIGHT + count] = w[SIZE : SIZE + count]
     normal_equations(p, smeared, x0, y0, count, w, H)
     return True
+
+
+@njit(**FAST)
+def _weigh_levels(first, count, scale, w):  # type: ignore[no-untyped-def]
+    """Fills a linearised chunk's weights, 1 at the outline; returns how many are small."""
+    count = min(count, CHUNK)
+    first = min(max(first, 0), LARGEST - CHUNK)
+    one = np.float32(1.0)
+    strange = np.float32(0.0)
+    for k in range(count):
+        z = w[J + 12 * CHUNK + k] / scale
+        far = abs(w[J + 8 * CHUNK + k] - np.float32(0.5)) > np.float32(0.4999)
+        weight = one / (one + z * z * z * z) if far else one
+        w[SIZE + first + k] = weight
+        strange += one if weight < np.float32(0.3) else np.float32(0.0)
+    return strange
 
 
 @njit(**FAST)

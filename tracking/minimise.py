@@ -3,7 +3,19 @@
 import numpy as np
 from numba import njit
 
-from tracking.disc import CHUNK, FAST, LARGEST, LEAST_BLUR, MOST_BLUR, PARAMETERS, WEIGHT, WEIGHTED, J, linearise
+from tracking.disc import (
+    CHUNK,
+    FAST,
+    LARGEST,
+    LEAST_BLUR,
+    MOST_BLUR,
+    PARAMETERS,
+    WEIGHT,
+    WEIGHTED,
+    J,
+    filled_up,
+    linearise,
+)
 
 NEAR = 0.03  # px: the next step would be a hundred times smaller
 # Steps that leave the normal matrix nearly as it was: of the centre and of the radius [px], and the share by which the
@@ -19,7 +31,7 @@ def normal_equations(p, smeared, x0, y0, count, w, H):  # type: ignore[no-untype
     """Fills H (13, 13), lower triangle: J W J^T; its last row ends in the weighted squared residual."""
     H[:] = 0.0
     for first in range(0, count, CHUNK):
-        some = min(CHUNK, count - first)
+        some = filled_up(min(CHUNK, count - first))
         linearise(p, smeared, x0, y0, first, some, w)
         add_products(first, some, w, H)
 
@@ -72,7 +84,7 @@ def _score(p, smeared, x0, y0, count, w, score):  # type: ignore[no-untyped-def]
     score[:] = 0.0
     total = 0.0
     for first in range(0, count, CHUNK):
-        some = min(CHUNK, count - first)
+        some = filled_up(min(CHUNK, count - first))
         linearise(p, smeared, x0, y0, first, some, w)
         squares, _ = add_scores(first, some, w, score)
         total += squares
@@ -101,20 +113,20 @@ def add_scores(first, count, w, score):  # type: ignore[no-untyped-def]
 
 @njit(**FAST)
 def factorise(H, damping, L):  # type: ignore[no-untyped-def]
-    """L L^T = H + damping diag H; False where that is not positive definite."""
-    for i in range(PARAMETERS):
-        for j in range(i + 1):
-            total = H[i, j]
-            if i == j:
-                total += (damping + 1e-9) * H[i, i] + 1e-12
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return False
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
+    """L L^T = H + damping diag H, L's diagonal as reciprocals; False where that is not positive definite."""
+    for j in range(PARAMETERS):
+        for i in range(j, PARAMETERS):
+            L[i, j] = H[i, j]
+        L[j, j] += (damping + 1e-9) * H[j, j] + 1e-12
+    for j in range(PARAMETERS):
+        if not L[j, j] > 0.0:
+            return False
+        L[j, j] = 1.0 / np.sqrt(L[j, j])
+        for i in range(j + 1, PARAMETERS):
+            L[i, j] *= L[j, j]
+        for k in range(j + 1, PARAMETERS):
+            for i in range(k, PARAMETERS):
+                L[i, k] -= L[i, j] * L[k, j]
     return True
 
 
@@ -125,12 +137,12 @@ def substitute(L, x):  # type: ignore[no-untyped-def]
         total = x[i]
         for k in range(i):
             total -= L[i, k] * x[k]
-        x[i] = total / L[i, i]
+        x[i] = total * L[i, i]
     for i in range(PARAMETERS - 1, -1, -1):
         total = x[i]
         for k in range(i + 1, PARAMETERS):
             total -= L[k, i] * x[k]
-        x[i] = total / L[i, i]
+        x[i] = total * L[i, i]
 
 
 @njit(**FAST)
