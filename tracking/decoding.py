@@ -1,7 +1,6 @@
 """Frames out of a video file, decoded packet by packet; what is damaged is left out."""
 
 import gc
-import heapq
 import logging
 import os
 import queue
@@ -10,7 +9,6 @@ from collections import deque
 from collections.abc import Generator, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import av
@@ -19,7 +17,9 @@ from av.sidedata.sidedata import Type as SideData
 from numpy.typing import NDArray
 
 from groundwork import InputError
+from tracking.ahead import ahead
 from tracking.frame import MACROBLOCK, Frame, scaled
+from tracking.order import Decoded, Order, Piece
 
 # Decoders tell of damage in their log, the same words again for the next packet; what nobody listens to is nobody's
 # business.
@@ -45,13 +45,13 @@ OPEN = {"mjpeg"}
 # take about as long as following the dots in it. More than it needs would only keep the follower from its work.
 MOST_DECODERS, BYTES_EACH = 4, 40_000
 _heard: list[str] = []  # the decoders at work that must be heard; the log is one for the whole program
-DEEPEST = 32  # frames that may be shown before one that they refer to: H.264 and HEVC allow 16
 
 
 def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Iterator[Frame]:
     """Every frame of a video file in order; damaged ones, and those that refer to them, without a picture.
 
-    Each decoder works in one thread, which is what makes it own up to damage.
+    They are decoded in a thread of their own, a few ahead; each decoder works in one thread, which is what makes it
+    own up to damage.
 
     Args:
         path: of the file.
@@ -64,14 +64,8 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
     """
     shown: list[float] = []
     try:
-        with ExitStack() as stack:
-            container = stack.enter_context(av.open(str(path)))
-            codec = container.streams.video[0].codec_context.codec
-            stack.enter_context(_log_of(codec.name))
-            count = min(MOST_DECODERS, os.cpu_count() or 1, _decoders_worth(path)) if codec.intra_only else 1
-            containers = [container, *(stack.enter_context(av.open(str(path))) for _ in range(1, count))]
-            decoders = [_strict(item.streams.video[0]) for item in containers]
-            for frame in stack.enter_context(closing(_frames(container, decoders, notes))):
+        with closing(ahead(_pieces(path, notes), lambda piece: piece.size())) as pieces:
+            for frame in Order().frames(pieces):
                 shown.append(frame.time)
                 yield frame
     except (av.FFmpegError, OSError) as error:
@@ -83,6 +77,39 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
     if not shown:
         raise InputError(f"expected frames in {path}, found none; copy the video again from the camera")
     notes += _contradictions(path.name, frames, fps, np.array(shown))
+
+
+def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
+    """A video file's packets and what they decode to; whatever can be left to another thread is."""
+    with ExitStack() as stack:
+        container = stack.enter_context(av.open(str(path)))
+        stream = container.streams.video[0]
+        codec = stream.codec_context.codec
+        stack.enter_context(_log_of(codec.name))
+        count = min(MOST_DECODERS, os.cpu_count() or 1, _decoders_worth(path)) if codec.intra_only else 1
+        containers = [container, *(stack.enter_context(av.open(str(path))) for _ in range(1, count))]
+        decoders = [_strict(item.streams.video[0]) for item in containers]
+        tells = codec.name == "h264"
+        number = 0
+        coarser = 0.0  # not known yet
+        for packet, frames, complained in _all_decoded(_packets(container, stream, notes), decoders):
+            if tells and not coarser:
+                coarser = _coarser(bytes(packet))
+            taken = []
+            while frames:
+                asked = tells and number % ASKED == 0
+                # A decoder that needs no earlier pictures works the quicker the sooner it has its memory back.
+                taken.append(_taken(frames.pop(0), codec.intra_only or asked, coarser if asked else None))
+                number += 1
+                if asked:
+                    gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
+            yield Piece(packet, taken, complained)
+
+
+def _taken(frame: "av.VideoFrame", copy: bool, coarser: float | None) -> Decoded:
+    """What is needed of a frame; its steps only where `coarser` is given."""
+    picture = None if frame.is_corrupt else _grey(frame, copy)
+    return Decoded(frame.pts, picture, None if coarser is None or picture is None else _steps(frame, coarser))
 
 
 def _decoders_worth(path: Path) -> int:
@@ -112,156 +139,6 @@ def _strict(stream: "av.video.stream.VideoStream") -> "av.CodecContext":
     stream.codec_context.thread_count = 1
     stream.codec_context.options = STRICT
     return stream.codec_context
-
-
-def _frames(
-    container: "av.container.InputContainer", decoders: list["av.CodecContext"], notes: list[str]
-) -> Generator[Frame]:
-    stream = container.streams.video[0]
-    assert stream.time_base is not None
-    tells = stream.codec_context.name == "h264"
-    alone = stream.codec_context.codec.intra_only
-    order = _Order(float(stream.time_base))
-    number = 0
-    coarser = 0.0  # not known yet
-    shape: tuple[int, ...] | None = None
-    for packet, frames, trouble in _all_decoded(_packets(container, stream, notes), decoders):
-        order.expect(packet)
-        if tells and not coarser:
-            coarser = _coarser(bytes(packet))
-        if trouble:
-            order.spoil(packet.pts)
-        while frames:
-            frame = frames.pop(0)
-            asked = tells and number % ASKED == 0
-            # A decoder that needs no earlier pictures works the quicker the sooner it has its memory back.
-            stamp, picture = frame.pts, None if frame.is_corrupt else _grey(frame, copy=alone or asked)
-            shape = picture.shape if shape is None and picture is not None else shape
-            if picture is None or picture.shape != shape:  # damage may turn pictures, too
-                order.spoil(stamp)
-            steps = _steps(frame, coarser) if asked and picture is not None else None
-            del frame
-            if asked:
-                gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
-            yield from order.shown(_Decoded(stamp, picture, steps))
-            number += 1
-    yield from order.rest()
-
-
-@dataclass(frozen=True)
-class _Decoded:
-    """A frame as it comes out of the decoder."""
-
-    stamp: int | None
-    picture: NDArray | None
-    steps: NDArray | None
-
-
-@dataclass(frozen=True)
-class _Packet:
-    """Where a frame stands among the others.
-
-    Attributes:
-        number: in the order of decoding.
-        group: key frames up to and with this one.
-        leading: shown before the key frame of its group, so that it may refer to the group before.
-        last: the latest time stamp of all that were decoded up to it.
-    """
-
-    number: int
-    group: int
-    leading: bool
-    last: int
-
-
-@dataclass
-class _Order:
-    """Puts frames into the order in which they are shown, each in its slot.
-
-    Every packet has a slot by its time stamp. A frame that comes out of the decoder fills its own; slots before it
-    that are still empty were lost, and what comes for them later is dropped. A damaged frame spoils those of its group
-    that were decoded after it. Some decoders own up to damage only when the frame comes out, and frames that refer to
-    it may be shown before it: none is given on before all that were decoded before it are out.
-    """
-
-    base: float
-    packets: dict[int, _Packet] = field(default_factory=dict)
-    waiting: list[int] = field(default_factory=list)
-    held: deque[_Decoded] = field(default_factory=deque)
-    gone: set[int] = field(default_factory=set)  # stamps of lost slots
-    broken: dict[int, int] = field(default_factory=dict)  # by group, the first damaged packet
-    count: int = 0
-    group: int = 0
-    key: int | None = None
-    last: int | None = None  # latest stamp of all packets
-    start: int | None = None
-
-    def expect(self, packet: "av.packet.Packet") -> None:
-        """Takes note of a packet that is about to be decoded."""
-        stamp = packet.pts
-        if packet.is_keyframe:
-            self.group += 1
-            self.key = stamp
-        self.count += 1
-        if packet.size and stamp is not None:
-            self.last = stamp if self.last is None else max(self.last, stamp)
-            leading = self.key is not None and stamp < self.key
-            self.packets[stamp] = _Packet(self.count, self.group, leading, self.last)
-            heapq.heappush(self.waiting, stamp)
-
-    def spoil(self, stamp: int | None) -> None:
-        """What is stamped so is damaged; without a stamp, what was decoded last."""
-        packet = None if stamp is None else self.packets.get(stamp)
-        number, group = (self.count, self.group) if packet is None else (packet.number, packet.group)
-        self.broken[group] = min(number, self.broken.get(group, number))
-
-    def shown(self, frame: _Decoded) -> Iterator[Frame]:
-        """The frames that can be given on once this one is out."""
-        if frame.stamp not in self.gone:
-            self.held.append(frame)
-        while self.held and (len(self.held) > DEEPEST or self._is_ready(self.held[0], frame.stamp)):
-            yield from self._given_on(self.held.popleft())
-
-    def rest(self) -> Iterator[Frame]:
-        """All that is left when the decoder is empty."""
-        while self.held:
-            yield from self._given_on(self.held.popleft())
-        yield from self._lost(None)
-
-    def _is_ready(self, frame: _Decoded, out: int | None) -> bool:
-        packet = None if frame.stamp is None else self.packets.get(frame.stamp)
-        return packet is None or out is None or packet.last <= out
-
-    def _given_on(self, frame: _Decoded) -> Iterator[Frame]:
-        if frame.stamp is None:
-            sound = self.group not in self.broken
-            yield Frame(np.nan, frame.picture if sound else None, frame.steps if sound else None)
-            return
-        yield from self._lost(frame.stamp)
-        sound = self._is_sound(self.packets.pop(frame.stamp, None))
-        yield Frame(self._time(frame.stamp), frame.picture if sound else None, frame.steps if sound else None)
-
-    def _is_sound(self, packet: _Packet | None) -> bool:
-        if packet is None:
-            return self.group not in self.broken
-        if packet.leading and packet.group - 1 in self.broken:
-            return False
-        return packet.number < self.broken.get(packet.group, packet.number + 1)
-
-    def _lost(self, stamp: int | None) -> Iterator[Frame]:
-        """The slots before `stamp`, or all that are left."""
-        while self.waiting and (stamp is None or self.waiting[0] < stamp):
-            lost = heapq.heappop(self.waiting)
-            self.packets.pop(lost, None)
-            self.gone.add(lost)
-            yield Frame(self._time(lost), None)
-        if self.waiting and self.waiting[0] == stamp:
-            heapq.heappop(self.waiting)
-
-    def _time(self, stamp: int) -> float:
-        if self.start is None:
-            self.start = stamp
-        return (stamp - self.start) * self.base
 
 
 def _packets(

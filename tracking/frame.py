@@ -24,6 +24,10 @@ class Frame:
     picture: NDArray | None
     steps: NDArray | None = None
 
+    def size(self) -> int:
+        """Of the picture [bytes]."""
+        return 0 if self.picture is None else self.picture.nbytes
+
     def step_at(self, places: NDArray) -> NDArray:
         """The steps at places [px], (D, 2); NaN where they are not known, (D)."""
         if self.steps is None:

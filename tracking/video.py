@@ -1,9 +1,7 @@
 """Grey pictures and their times out of video files and folders of images."""
 
-import queue
 import re
-import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,15 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from groundwork import InputError
+from tracking.ahead import ahead
 from tracking.decoding import frames_of_file, quarter_turns
 from tracking.frame import Frame, scaled
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg", ".mpeg", ".ts"}
 PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
-# Pictures decoded before they are asked for, as the first takes its time: how many handfuls of how many bytes. Two
-# threads that wait for each other at every picture lose a twentieth of their time.
-HANDFULS, HANDFUL = 12, 2**22
-SMALL = 2**20  # bytes that a lost picture counts for
 
 
 @dataclass
@@ -62,10 +57,9 @@ class Video:
         """
         reading = Reading(iter(()))
         if self.path.is_dir():
-            source = _folder_frames(self.path)
+            reading.frames = ahead(_folder_frames(self.path), lambda frame: frame.size())
         else:
-            source = frames_of_file(self.path, self.frames, self.fps, reading.notes)
-        reading.frames = _ahead(source)
+            reading.frames = frames_of_file(self.path, self.frames, self.fps, reading.notes)
         return reading
 
 
@@ -134,7 +128,7 @@ def _read_picture(path: Path) -> NDArray | None:
     return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
 
 
-def _folder_frames(folder: Path) -> Iterator[Frame]:
+def _folder_frames(folder: Path) -> Generator[Frame]:
     shape: tuple[int, ...] | None = None
     bits = 8
     for path in _pictures_in(folder):
@@ -149,48 +143,3 @@ def _folder_frames(folder: Path) -> Iterator[Frame]:
             raise InputError(f"expected pictures of one size in {folder}, found another in {path.name}; remove it")
         shape = picture.shape
         yield Frame(np.nan, picture if picture.dtype == np.uint8 else scaled(picture, bits))
-
-
-def _ahead(source: Iterator[Frame]) -> Iterator[Frame]:
-    """The same frames, made in a thread of their own and handed over by the handful."""
-    made: queue.Queue[list[Frame] | BaseException | None] = queue.Queue(HANDFULS)
-    stopped = threading.Event()
-
-    def put(item: list[Frame] | BaseException | None) -> None:
-        while not stopped.is_set():
-            try:
-                made.put(item, timeout=0.2)
-            except queue.Full:
-                continue
-            return
-
-    def work() -> None:
-        handful: list[Frame] = []
-        size = 0
-        try:
-            for frame in source:
-                handful.append(frame)
-                size += SMALL if frame.picture is None else frame.picture.nbytes
-                if size >= HANDFUL:
-                    put(handful)
-                    handful, size = [], 0
-                if stopped.is_set():
-                    return
-            put(handful)
-            put(None)
-        except Exception as error:  # handed to whoever reads
-            put(handful)
-            put(error)
-
-    thread = threading.Thread(target=work, daemon=True)
-    thread.start()
-    try:
-        while (item := made.get()) is not None:
-            if isinstance(item, BaseException):
-                raise item
-            item.reverse()
-            while item:
-                yield item.pop()  # and keeps no picture that nobody else does
-    finally:
-        stopped.set()
-        thread.join()

@@ -12,7 +12,8 @@ import pytest
 from support import FRAMES, ramp, write_video
 
 from groundwork import InputError
-from tracking.decoding import _Decoded, _Order, frames_of_file
+from tracking.decoding import _pieces, frames_of_file
+from tracking.order import Decoded, Order, Piece
 from tracking.video import open_video
 
 SAFE = {"libx264": {"g": "6"}, "ffv1": {"level": "3", "slicecrc": "1", "g": "6"}}  # short groups, checksums
@@ -218,44 +219,46 @@ def test_the_log_is_on_wherever_it_is_needed(tmp_path: Path) -> None:
     """Off for MJPEG alone; a video read beside it whose decoder must be heard turns it on."""
     write_video(tmp_path / "a.avi", "mjpeg", "yuvj420p")
     write_video(tmp_path / "b.mkv", "ffv1", "gray")
-    quiet = frames_of_file(tmp_path / "a.avi", 0, 0.0, [])
+    quiet = _pieces(tmp_path / "a.avi", [])
     next(quiet)
     assert av.logging.get_level() is None
-    loud = frames_of_file(tmp_path / "b.mkv", 0, 0.0, [])
+    loud = _pieces(tmp_path / "b.mkv", [])
     next(loud)
-    other = frames_of_file(tmp_path / "a.avi", 0, 0.0, [])
+    other = _pieces(tmp_path / "a.avi", [])
     next(other)
     assert av.logging.get_level() == av.logging.ERROR
     for reading in (quiet, loud, other):
-        assert len(list(reading)) == FRAMES - 1
+        assert sum(len(piece.frames) for piece in reading) == FRAMES - 1
         assert av.logging.get_level() == av.logging.ERROR
 
 
 def test_a_stamp_far_ahead_does_not_keep_the_others_waiting() -> None:
     """One packet of a hundred is stamped with nonsense; the others come one by one all the same."""
-    order, given = _Order(0.01), []
-    for number in range(100):
-        stamp = 10**9 if number == 20 else number
-        order.expect(SimpleNamespace(pts=stamp, size=10, is_keyframe=number == 0))
-        if number != 20:
-            given += order.shown(_Decoded(stamp, ramp(number % 12), None))
+    order = Order()
+    pieces = [
+        piece(10**9 if number == 20 else number, number == 0, *([] if number == 20 else [number]))
+        for number in range(100)
+    ]
+    given = []
+    for frame in order.frames(pieces):
+        given.append(frame)
         assert len(order.held) <= 33
-    given += order.rest()
     assert [round(100 * frame.time) for frame in given] == [*range(20), *range(21, 100), 10**9]
     assert all(frame.picture is not None for frame in given[:-1])
 
 
 def test_a_frame_that_comes_after_its_slot_was_given_up_is_dropped() -> None:
     """As a damaged packet's does, long after frames that are shown later: every slot is given on once."""
-    order, given = _Order(0.01), []
-    for number in range(6):
-        order.expect(SimpleNamespace(pts=number, size=10, is_keyframe=True))
-        if number != 2:
-            given += order.shown(_Decoded(number, ramp(number), None))
-    given += order.shown(_Decoded(2, ramp(2), None))
-    given += order.rest()
+    out = [[0], [1], [], [3], [4], [5, 2]]
+    given = list(Order().frames(piece(number, True, *out[number]) for number in range(6)))
     assert [round(100 * frame.time) for frame in given] == list(range(6))
     assert [frame.picture is None for frame in given] == [number == 2 for number in range(6)]
+
+
+def piece(stamp: int, key: bool, *out: int) -> Piece:
+    """A packet of a hundredth of a second's frame, after which the decoder gives some."""
+    packet = SimpleNamespace(pts=stamp, size=10, is_keyframe=key, time_base=Fraction(1, 100))
+    return Piece(packet, [Decoded(number, ramp(number % 12), None) for number in out], complained=False)
 
 
 def test_dropped_frames_and_uneven_times_are_honoured(tmp_path: Path) -> None:
