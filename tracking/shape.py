@@ -25,6 +25,7 @@ FAR = 0.12  # of a marker: what a dot one spacing from its expected place costs,
 TURNS = np.radians([0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0])  # tried where the body is lost
 SEED_MARKERS, SEED_DOTS = 8, 5  # from how many markers, and how many dots of each, a match may begin
 ROUGH = 0.5  # of a marker: what a dot at the gate's edge costs
+STILL = 0.01  # spacings: a dot that keeps its place so exactly may be a mark on the frame that holds the body
 
 
 @dataclass(frozen=True)
@@ -245,7 +246,10 @@ def recognise(
     best, score = search.grow(shape, expected, _local_maps(pattern, shape, expected), far, steady, seeds)
     if (best >= 0).sum() >= min(len(shape), len(dots)):
         return best
-    # Markers and dots are left over: the body may stand where nobody expects it.
+    # Markers and dots are left over: some may be marks beside the body, or it may stand where nobody expects it.
+    other, other_score = _with_marks(pattern, shape, expected, trusted, dots, reach, far, steady)
+    if other_score > score:
+        best, score = other, other_score
     for turn in TURNS:
         cos, sin = np.cos(turn), np.sin(turn)
         linear = np.tile([[cos, -sin], [sin, cos]], (len(shape), 1, 1))
@@ -254,6 +258,27 @@ def recognise(
             if other_score > score:
                 best, score = other, other_score
     return best
+
+
+def _with_marks(
+    pattern: Pattern, shape: Array, expected: Array, trusted: Array, dots: Array, reach: float, far: float,
+    steady: Array,
+) -> tuple[NDArray[np.int64], float]:  # fmt: skip
+    """The best match (M) in which whoever can keep its place does, as marks on the frame would, and its score."""
+    gap, nearest = cKDTree(dots).query(shape)
+    match = np.where(gap < STILL * pattern.spacing, nearest, -1)
+    moving, free = np.flatnonzero(match < 0), np.setdiff1d(np.arange(len(dots)), match)
+    marks = len(match) - len(moving)
+    if not marks or not len(moving) or not len(free):
+        return match, float(marks)
+    body, own = Pattern.of(pattern.rest[moving]), expected[moving]
+    search = _Search.of(body, dots[free])
+    grown, score = search.grow(
+        shape[moving], own, _local_maps(body, shape[moving], own), far, steady[moving],
+        search.seeds(own, trusted[moving], reach),
+    )  # fmt: skip
+    match[moving[grown >= 0]] = free[grown[grown >= 0]]
+    return match, marks + score
 
 
 def match_shape(pattern: Pattern, dots: Array, far: float) -> tuple[float, NDArray[np.int64]]:

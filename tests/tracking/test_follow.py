@@ -64,6 +64,18 @@ def test_no_dot_changes_its_identity(swing: float) -> None:
     assert np.nanmax(np.linalg.norm(found - truth, axis=2)) < 0.3
 
 
+@pytest.mark.parametrize(("turn", "height"), [(0.5, 205.0), (-0.5, 20.0)])
+def test_marks_on_the_frame_keep_their_names_beside_a_fast_body(turn: float, height: float) -> None:
+    """Six marks stand still within a spacing of a tip that moves by one a frame; they do not move with it."""
+    swinging = bent(grid(), 34.0 * np.sin(2 * np.pi * np.arange(24) / 6.3 + np.pi * turn)) - np.array([0.0, 5.0])
+    marks = np.stack([30.0 + 44.0 * np.arange(6), np.full(6, height)], axis=1)
+    truth = np.concatenate([swinging, np.tile(marks, (24, 1, 1))], axis=1)
+    tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
+    found = tracks.pixel[:, order(tracks.start, truth[0])]
+    assert np.isfinite(found).mean() > 0.99
+    assert np.nanmax(np.linalg.norm(found - truth, axis=2)) < 0.3
+
+
 def test_hidden_dots_come_back_under_their_names() -> None:
     rest = grid()
     truth = bent(rest, 15.0 * np.sin(2 * np.pi * np.arange(20) / 16))
