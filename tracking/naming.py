@@ -70,10 +70,26 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
     Raises:
         InputError: fewer than three dots match the layout.
     """
-    markers = visible_markers(layout, camera)
-    if len(dots) > len(markers):  # the skin is hollow there, or spheres on stands are seen from behind
-        markers = _not_behind_others(layout, camera)
-    pixels = camera.undistort(dots)
+    markers, pixels = visible_markers(layout, camera), camera.undistort(dots)
+    names = _named(pixels, layout, camera, markers)
+    if len(dots) > len(markers):  # marks on the frame; or the skin is hollow, or spheres on stands are seen from behind
+        more = _not_behind_others(layout, camera)
+        wider = _named(pixels, layout, camera, more)
+        named, left = names >= 0, names < 0
+        agreeing = (wider[named] == names[named]).mean() > ENOUGH if named.any() else True
+        if (agreeing or left.sum() > named.sum()) and (wider[left] >= 0).sum() > 0.5 * left.sum():
+            names, markers = wider, more
+    matched = int((names >= 0).sum())
+    if matched < FEWEST:
+        raise InputError(
+            f"{what}: expected dots in the pattern of the specimen's markers, found {matched} of "
+            f"{len(markers)} that match; check --specimen, and that calib.yaml belongs to this set-up"
+        )
+    return names.tolist()
+
+
+def _named(pixels: Array, layout: MarkerLayout, camera: Camera, markers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which of some of the layout's markers each dot (D, 2) is, (D), -1 for none."""
     expected = camera.ideal(layout.positions[markers])
     best: tuple[float, Array] = (-np.inf, np.full(len(markers), -1))
     enough = ENOUGH * min(len(pixels), len(markers))
@@ -86,15 +102,8 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str)
                 break
         if best[0] > enough:
             break
-    matched = np.flatnonzero(best[1] >= 0)
-    if len(matched) < FEWEST:
-        raise InputError(
-            f"{what}: expected dots in the pattern of the specimen's markers, found {len(matched)} of "
-            f"{len(markers)} that match; check --specimen, and that calib.yaml belongs to this set-up"
-        )
-    names = [-1] * len(dots)
-    for marker in matched:
-        names[best[1][marker]] = int(markers[marker])
+    names = np.full(len(pixels), -1)
+    names[best[1][best[1] >= 0]] = markers[best[1] >= 0]
     return names
 
 

@@ -14,14 +14,14 @@ CAMERA = OrthographicCamera(
 )
 
 
-def two_sided() -> MarkerLayout:
-    """16 markers on each side face of a beam, the sides mirror images of each other."""
+def two_sided(off: float = 0.0) -> MarkerLayout:
+    """16 markers on each side face of a beam, the far side's `off` m nearer to the tip."""
     names, places = [], []
     for side, y in (("L", 0.0), ("R", 0.03)):
         for row, z in enumerate((0.02, 0.01)):
             for column in range(8):
                 names.append(f"{side}{row}{column}")
-                places.append((0.010 + 0.012 * column, y, z))
+                places.append((0.010 + 0.012 * column + (off if side == "R" else 0.0), y, z))
     return MarkerLayout(tuple(names), np.array(places))
 
 
@@ -115,6 +115,22 @@ def test_missing_and_false_dots(random: np.random.Generator) -> None:
     kept = np.delete(np.arange(16), [3, 12])
     names = name_by_layout(np.vstack([dots[kept], [[20.0, 30.0], [1200.0, 700.0]]]), LAYOUT, CAMERA, "a video")
     assert names == [*kept.tolist(), -1, -1]
+
+
+@pytest.mark.parametrize("bend", [0.0, 0.002, 0.005, 0.02])
+def test_marks_on_the_frame_do_not_turn_one_side_into_the_other(bend: float, random: np.random.Generator) -> None:
+    """More dots than the near side has markers: the far side's, which stand between those, would match them too."""
+    layout = two_sided(off=0.006)
+    for _ in range(6):
+        marks = np.column_stack([random.uniform(-30, -6, 3), np.zeros(3), random.uniform(-15, 45, 3)]) / 1000.0
+        names = name_by_layout(np.vstack([filmed(bend=bend), CAMERA.project(marks)]), layout, CAMERA, "a video")
+        assert names == [*range(16), -1, -1, -1]
+
+
+def test_all_sides_of_a_clear_body_are_named(random: np.random.Generator) -> None:
+    layout = two_sided(off=0.006)
+    mixed = random.permutation(32)
+    assert name_by_layout(CAMERA.project(layout.positions)[mixed], layout, CAMERA, "a video") == mixed.tolist()
 
 
 def test_another_pattern_is_refused(random: np.random.Generator) -> None:
