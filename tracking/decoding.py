@@ -103,7 +103,8 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
                 number += 1
                 if asked:
                     gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
-            yield Piece(packet, taken, complained)
+            stamp = packet.pts if packet.size else None
+            yield Piece(stamp, packet.is_keyframe, float(packet.time_base), taken, complained)
 
 
 def _taken(frame: "av.VideoFrame", copy: bool, coarser: float | None) -> Decoded:

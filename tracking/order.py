@@ -5,7 +5,6 @@ from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 
-import av
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,15 +30,19 @@ class Decoded:
 
 @dataclass(frozen=True)
 class Piece:
-    """A packet and what came out of the decoder after it.
+    """What a packet says of the frame in it, and what came out of the decoder after it.
 
     Attributes:
-        packet: as it is in the file.
+        stamp: when its frame is shown, in the stream's own unit; None where it does not say, or holds none.
+        key: whether its frame is decoded without others.
+        unit: of the stamp [s].
         frames: those that were ready.
         complained: whether the decoder found damage.
     """
 
-    packet: "av.packet.Packet"
+    stamp: int | None
+    key: bool
+    unit: float
     frames: list[Decoded]
     complained: bool
 
@@ -91,25 +94,24 @@ class Order:
     def frames(self, pieces: Iterable[Piece]) -> Iterator[Frame]:
         """The frames of pieces in the order of decoding, as they can be given on."""
         for piece in pieces:
-            self._expect(piece.packet)
+            self._expect(piece)
             if piece.complained:
-                self._spoil(piece.packet.pts)
+                self._spoil(piece.stamp)
             while piece.frames:
                 yield from self._shown(piece.frames.pop(0))
         while self.held:
             yield from self._given_on(self.held.popleft())
         yield from self._lost(None)
 
-    def _expect(self, packet: "av.packet.Packet") -> None:
-        """Takes note of a packet that is about to be decoded."""
-        stamp = packet.pts
-        if not self.base:
-            self.base = float(packet.time_base)
-        if packet.is_keyframe:
+    def _expect(self, piece: Piece) -> None:
+        """Takes note of a packet whose frame is to come out."""
+        stamp = piece.stamp
+        self.base = self.base or piece.unit
+        if piece.key:
             self.group += 1
             self.key = stamp
         self.count += 1
-        if packet.size and stamp is not None:
+        if stamp is not None:
             self.last = stamp if self.last is None else max(self.last, stamp)
             leading = self.key is not None and stamp < self.key
             self.packets[stamp] = _Packet(self.count, self.group, leading, self.last)

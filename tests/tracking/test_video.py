@@ -3,7 +3,6 @@ import threading
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from types import SimpleNamespace
 
 import av
 import cv2
@@ -257,8 +256,7 @@ def test_a_frame_that_comes_after_its_slot_was_given_up_is_dropped() -> None:
 
 def piece(stamp: int, key: bool, *out: int) -> Piece:
     """A packet of a hundredth of a second's frame, after which the decoder gives some."""
-    packet = SimpleNamespace(pts=stamp, size=10, is_keyframe=key, time_base=Fraction(1, 100))
-    return Piece(packet, [Decoded(number, ramp(number % 12), None) for number in out], complained=False)
+    return Piece(stamp, key, 0.01, [Decoded(number, ramp(number % 12), None) for number in out], complained=False)
 
 
 def test_dropped_frames_and_uneven_times_are_honoured(tmp_path: Path) -> None:
