@@ -21,15 +21,7 @@ from tracking.disc import (
     linearise,
     smear,
 )
-from tracking.minimise import (
-    NEAR,
-    add_products,
-    add_scores,
-    keep_possible,
-    minimise,
-    normal_equations,
-    substitute,
-)
+from tracking.minimise import add_products, add_scores, keep_possible, minimise, normal_equations, substitute
 
 # Converged; the centre's variances by independent errors of one grey level (2), by blocks (2); mean squared residual;
 # share used; how far the pixels that are not quite trusted pull the centre (2).
@@ -38,6 +30,9 @@ OUTLYING = 0.12  # of the contrast: a pixel farther off than this shows somethin
 STRANGE = 0.25  # of the contrast: a level this far from what the start expects
 LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edge does not describe any more
 DOUBTED = 0.9  # weight: below it a pixel is not quite trusted
+# The centre's last step, and what it may be worth as a share of the squared residual: the next is smaller still.
+SETTLED, WORTH = 0.005, 0.01
+SHRINKING = 0.4  # of one step to the next by the same normal matrix, at most
 BLOCK = 4  # px: errors closer than this are not taken to be independent
 
 
@@ -58,12 +53,35 @@ def _reweight(count, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untyped-def]
-    """The last small step, by the factor at hand, and the centre's variances; fills quality.
+def _settle(p, smeared, x0, y0, count, w, H, L, length, cost, quality):  # type: ignore[no-untyped-def]
+    """Small steps from where `minimise` ended, to the minimum; fills quality and returns whether it was reached.
+
+    length: of the step that led to p [px]; cost: before it.
+    """
+    for _ in range(4):
+        for _ in range(4):
+            if not length < np.inf:
+                return False
+            before, cost_before = length, cost
+            length, cost, gain = _assess(p, smeared, x0, y0, count, w, L, quality)
+            if cost > cost_before * 1.001:
+                break
+            if length < SETTLED and gain < WORTH * cost:
+                return True
+            if length > SHRINKING * before:
+                break
+        normal_equations(p, smeared, x0, y0, count, w, H)
+        length, cost = minimise(p, smeared, x0, y0, count, w, H, L)
+    return False
+
+
+@njit(**FAST)
+def _assess(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untyped-def]
+    """Fills quality and takes a small step by the factor at hand; returns its length, the cost before it and the gain.
 
     Variances as independent errors of the residual's size give them, and as the scores summed over blocks
     of pixels say: compression leaves errors that neighbours share. Pixels that are not quite trusted, at a highlight's
-    edge, may all be off to one side: how far they pull the centre is an error by itself. Returns the size of the step.
+    edge, may all be off to one side: how far they pull the centre is an error by itself.
     """
     n = PARAMETERS
     pull = np.zeros((2, n))  # rows of H^-1: how the centre follows each score
@@ -74,15 +92,15 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
     blocks = np.zeros((2, side * side))
     white, doubted = np.zeros(2), np.zeros(2)
     score = np.zeros(n)
-    squares = 0.0
+    cost = 0.0
     used = 0.0
     for first in range(0, count, CHUNK):
         some = filled_up(min(CHUNK, count - first))
         linearise(p, smeared, x0, y0, first, some, w)
         _add_influence(first, some, w, pull, white, blocks, doubted)
-        squares_here, used_here = add_scores(first, some, w, score)
-        squares += squares_here
-        used += used_here
+        squares, weight = add_scores(first, some, w, score)
+        cost += squares
+        used += weight
     for axis in range(2):
         shared = 0.0
         for cell in range(side * side):
@@ -90,13 +108,16 @@ def _finish(p, smeared, x0, y0, count, w, L, quality):  # type: ignore[no-untype
         quality[1 + axis] = white[axis]
         quality[3 + axis] = shared
         quality[7 + axis] = doubted[axis]
-    quality[5] = squares / max(used - n, 1.0)
-    quality[6] = used / count
-    substitute(L, score)
+    step = score.copy()
+    substitute(L, step)
+    gain = 0.0
     for i in range(n):
-        p[i] += score[i]
+        gain += step[i] * score[i]
+        p[i] += step[i]
     keep_possible(p, smeared)
-    return max(abs(score[0]), abs(score[1]))
+    quality[5] = max(cost - gain, 0.0) / max(used - n, 1.0)
+    quality[6] = used / count
+    return max(abs(step[0]), abs(step[1])), cost, gain
 
 
 @njit(**FAST)
@@ -159,6 +180,8 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
     smeared = False
     away = 1.0 + 2.0 / np.sqrt(max(p[2] * p[4] - p[3] * p[3], 1e-12))
     left, right, top, bottom = p[0] - away, p[0] + away, p[1] - away, p[1] + away
+    strange = False
+    length = cost = np.inf
     count = 0
     x0 = 0
     y0 = 0
@@ -168,9 +191,8 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
         if count < 3 * n:
             return
         strange = _distrust(p, smeared, x0, y0, count, w, H)
-        if not minimise(p, smeared, x0, y0, count, w, H, L):
-            return
-        if not (left < p[0] < right and top < p[1] < bottom):
+        length, cost = minimise(p, smeared, x0, y0, count, w, H, L)
+        if not (length < np.inf and left < p[0] < right and top < p[1] < bottom):
             return
         if abs(p[0] - x0) < 1.5 and abs(p[1] - y0) < 1.5:
             break
@@ -179,19 +201,18 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
         smeared = True
         smear(p)
         normal_equations(p, smeared, x0, y0, count, w, H)
-        if not minimise(p, smeared, x0, y0, count, w, H, L):
-            return
+        length, cost = minimise(p, smeared, x0, y0, count, w, H, L)
+    if not _settle(p, smeared, x0, y0, count, w, H, L, length, cost, quality):
+        return
     if strange or _outlying(count, w) > OUTLYING * abs(p[8]):
         for _ in range(6):
             change = _reweight(count, w)
             normal_equations(p, smeared, x0, y0, count, w, H)
-            if not minimise(p, smeared, x0, y0, count, w, H, L):
+            length, cost = minimise(p, smeared, x0, y0, count, w, H, L)
+            if not _settle(p, smeared, x0, y0, count, w, H, L, length, cost, quality):
                 return
             if change < 0.1:
                 break
-    for _ in range(3):
-        if _finish(p, smeared, x0, y0, count, w, L, quality) < 0.1 * NEAR:
-            break
     if smeared:  # back to W, from which another fit may start
         p[5], p[6], p[7] = p[5] + p[6] ** 2 / 12.0, p[6] * p[7] / 12.0, p[5] + p[7] ** 2 / 12.0
     quality[0] = 1.0

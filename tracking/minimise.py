@@ -17,13 +17,10 @@ from tracking.disc import (
     linearise,
 )
 
-NEAR = 0.03  # px: the next step would be a hundred times smaller
 # Steps that leave the normal matrix nearly as it was: of the centre and of the radius [px], and the share by which the
 # contrast and the edge's variance may change.
 CLOSE, SWELLING, CHANGE = 1.0, 0.3, 0.05
-SHRINKING = 0.4  # of one such step to the next, at most
 LITTLE = 1e-3  # of the normal matrix' diagonal: damping that changes neither steps nor variances to speak of
-WORTHLESS = 1.0  # of a pixel's mean squared residual: a gain that says nothing more about the disc
 
 
 @njit(**FAST)
@@ -76,19 +73,6 @@ def add_products(first, count, w, H):  # type: ignore[no-untyped-def]
             H[i + 1, j + 3] += sum13
     squares, _ = add_scores(first, count, w, H[PARAMETERS])
     H[PARAMETERS, PARAMETERS] += squares
-
-
-@njit(**FAST)
-def _score(p, smeared, x0, y0, count, w, score):  # type: ignore[no-untyped-def]
-    """Fills score (12), J W r; returns the weighted squared residual."""
-    score[:] = 0.0
-    total = 0.0
-    for first in range(0, count, CHUNK):
-        some = filled_up(min(CHUNK, count - first))
-        linearise(p, smeared, x0, y0, first, some, w)
-        squares, _ = add_scores(first, some, w, score)
-        total += squares
-    return total
 
 
 @njit(**FAST)
@@ -165,38 +149,11 @@ def _is_close(p, step):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _approach(p, smeared, x0, y0, count, w, L, length, best):  # type: ignore[no-untyped-def]
-    """Goes on from p with one factor of the normal matrix; False, p being spoilt, where that does not get near.
-
-    length: of the step that led to p; best: cost before it.
-    """
-    score = np.zeros(PARAMETERS)
-    step = np.zeros(PARAMETERS)
-    for _ in range(4):
-        squares = _score(p, smeared, x0, y0, count, w, score)
-        if not squares <= best * (1.0 + 1e-6):
-            return False
-        step[:] = score
-        substitute(L, step)
-        gain = 0.0
-        for i in range(PARAMETERS):
-            gain += step[i] * score[i]
-            p[i] += step[i]
-        keep_possible(p, smeared)
-        best, before = squares, length
-        length = max(abs(step[0]), abs(step[1]))
-        if length < NEAR and gain * count < WORTHLESS * best:
-            return True
-        if length > SHRINKING * before:
-            return False
-    return False
-
-
-@njit(**FAST)
 def minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-def]
-    """Levenberg and Marquardt's steps from p, which is filled with the result; False where they fail.
+    """Levenberg and Marquardt's steps from p, at which H holds the normal equations.
 
-    H holds the normal equations at p. Ends within `NEAR` of the minimum; L then factors H there, or nearly.
+    Ends with the first step that leaves the normal matrix, which L factors, nearly as it was. p is filled with where
+    it leads. Returns how far the centre went with it [px], infinite where the steps fail, and the cost before it.
     """
     n = PARAMETERS
     trial = p.copy()
@@ -208,7 +165,7 @@ def minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-def
             normal_equations(trial, smeared, x0, y0, count, w, H)
         cost = H[n, n]
         if not cost < np.inf:
-            return False
+            return np.inf, best
         if cost <= best * (1.0 + 1e-6):
             best = cost
             p[:] = trial
@@ -216,24 +173,16 @@ def minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-def
                 step[i] = H[n, i]
             damping = max(0.1 * damping, 1e-7)
             if not factorise(H, damping, L):
-                return False
+                return np.inf, best
             substitute(L, step)
-            gain = 0.0
-            for i in range(n):
-                gain += step[i] * H[n, i]
         else:  # back, and less far
             damping = max(30.0 * damping, 1e-3)
             if damping > 1e4:
-                return False
+                return np.inf, best
             step *= 0.2
-            gain = np.inf
         trial[:] = p + step
         keep_possible(trial, smeared)
-        length = max(abs(step[0]), abs(step[1]))
-        if damping < LITTLE and length < NEAR and gain * count < WORTHLESS * best:
+        if damping < LITTLE and _is_close(p, step):
             p[:] = trial
-            return True
-        if damping < LITTLE and _is_close(p, step) and _approach(trial, smeared, x0, y0, count, w, L, length, best):
-            p[:] = trial
-            return True
-    return False
+            return max(abs(step[0]), abs(step[1])), best
+    return np.inf, best
