@@ -106,10 +106,10 @@ def filled_up(count):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-def]
+def linearise(p, instants, x0, y0, first, count, w):  # type: ignore[no-untyped-def]
     """Derivatives of a chunk's pixels, from the `first`, by the parameters, and the residual.
 
-    A disc that moves far while the shutter is open is a mean over `_instants`; p[5:8] are then the
+    A disc that moves far while the shutter is open is a mean over several instants; p[5:8] are then the
     edge's variance and the way moved instead of W.
     """
     count = min(count, CHUNK)  # said aloud, with the next, so that the loops become vector instructions
@@ -123,9 +123,9 @@ def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-d
     b = np.float32(p[3])
     c = np.float32(p[4])
     w0 = np.float32(p[5])
+    smeared = instants > 1
     w1 = np.float32(0.0 if smeared else 2.0 * p[6])
     w2 = np.float32(p[5] if smeared else p[7])
-    instants = _instants(p) if smeared else 1
     contrast = np.float32(p[8] / instants)
     level = np.float32(p[9])
     sx = np.float32(p[10])
@@ -196,15 +196,16 @@ def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-d
             xx = by_w * gx * gx
             xy = by_w * gx * gy
             yy = by_w * gy * gy
-            ax *= by_r
-            ay *= by_r
+            # The same blur is a larger share of a smaller dot.
+            hx = by_r * dx + np.float32(2.0) * by_w * (w0 * gx + half * w1 * gy)
+            hy = by_r * dy + np.float32(2.0) * by_w * (half * w1 * gx + w2 * gy)
             gx *= by_r
             gy *= by_r
             w[J + k] -= gx
             w[J + CHUNK + k] -= gy
-            w[J + 2 * CHUNK + k] += ax * dx
-            w[J + 3 * CHUNK + k] += ax * dy + ay * dx
-            w[J + 4 * CHUNK + k] += ay * dy
+            w[J + 2 * CHUNK + k] += ax * hx
+            w[J + 3 * CHUNK + k] += ax * hy + ay * hx
+            w[J + 4 * CHUNK + k] += ay * hy
             w[J + 5 * CHUNK + k] += xx + round_ * yy
             w[J + 6 * CHUNK + k] += twice * xy - way * gx
             w[J + 7 * CHUNK + k] += once * yy - way * gy
@@ -224,9 +225,9 @@ def linearise(p, smeared, x0, y0, first, count, w):  # type: ignore[no-untyped-d
 
 
 @njit(**FAST)
-def _instants(p):  # type: ignore[no-untyped-def]
-    """How many instants resolve the way p[6:8] moved during the exposure."""
-    return min(3 + int(np.hypot(p[6], p[7]) / (1.2 * np.sqrt(p[5]))), 32)
+def instants_of(p):  # type: ignore[no-untyped-def]
+    """How many instants resolve the way p[6:8] moved during the exposure, and a little more."""
+    return min(4 + int(np.hypot(p[6], p[7]) / (1.2 * np.sqrt(p[5]))), 32)
 
 
 @njit(**FAST)

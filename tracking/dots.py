@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tracking.disc import PARAMETERS, SCRATCH
-from tracking.fit import QUALITY, fit_disc
+from tracking.fit import fit_disc
+from tracking.minimise import QUALITY
 
 Array = NDArray[Any]
 

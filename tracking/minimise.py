@@ -1,9 +1,10 @@
-"""Levenberg and Marquardt's steps towards the disc that explains some pixels best."""
+"""Levenberg and Marquardt's steps towards the disc that explains some pixels best, and how well its place is known."""
 
 import numpy as np
 from numba import njit
 
 from tracking.disc import (
+    BLOCK_OF,
     CHUNK,
     FAST,
     LARGEST,
@@ -13,127 +14,34 @@ from tracking.disc import (
     WEIGHT,
     WEIGHTED,
     J,
+    X,
+    Y,
     filled_up,
     linearise,
 )
+from tracking.normal_equations import add_scores, factorise, normal_equations, substitute
 
+# Converged; the centre's variances by independent errors of one grey level (2), by blocks (2); mean squared residual;
+# share used; how far the pixels that are not quite trusted pull the centre (2).
+QUALITY = 9
 # Steps that leave the normal matrix nearly as it was: of the centre and of the radius [px], and the share by which the
 # contrast and the edge's variance may change.
 CLOSE, SWELLING, CHANGE = 1.0, 0.3, 0.05
 LITTLE = 1e-3  # of the normal matrix' diagonal: damping that changes neither steps nor variances to speak of
+# The centre's last step [px], and what it may be worth as a share of the squared residual: the next is smaller still.
+SETTLED, WORTH = 0.005, 0.01
+WORTHLESS = 0.4  # of a pixel's mean squared residual: a gain that says nothing more about the disc
+MUCH = 0.1  # damping that changes the centre's steps
+LEVEL = 1e-3  # of the squared residual: as much as before, but for rounding
+DOUBTED = 0.9  # weight: below it a pixel is not quite trusted
+BLOCK = 4  # px: errors closer than this are not taken to be independent
 
 
 @njit(**FAST)
-def normal_equations(p, smeared, x0, y0, count, w, H):  # type: ignore[no-untyped-def]
-    """Fills H (13, 13), lower triangle: J W J^T; its last row ends in the weighted squared residual."""
-    H[:] = 0.0
-    for first in range(0, count, CHUNK):
-        some = filled_up(min(CHUNK, count - first))
-        linearise(p, smeared, x0, y0, first, some, w)
-        add_products(first, some, w, H)
-
-
-@njit(**FAST)
-def add_products(first, count, w, H):  # type: ignore[no-untyped-def]
-    """Adds a chunk of linearised pixels to H (13, 13)."""
-    count = min(count, CHUNK)
-    first = min(max(first, 0), LARGEST - CHUNK)
-    for i in range(0, PARAMETERS, 2):  # two rows by four columns at once: what is loaded serves more than once
-        row = J + i * CHUNK
-        for k in range(count):
-            weight = w[WEIGHT + first + k]
-            w[WEIGHTED + k] = weight * w[row + k]
-            w[WEIGHTED + CHUNK + k] = weight * w[row + CHUNK + k]
-        for j in range(0, i + 2, 4):  # past the diagonal too
-            column = J + j * CHUNK
-            sum00 = sum01 = sum02 = sum03 = np.float32(0.0)
-            sum10 = sum11 = sum12 = sum13 = np.float32(0.0)
-            for k in range(count):
-                factor0 = w[WEIGHTED + k]
-                factor1 = w[WEIGHTED + CHUNK + k]
-                value0 = w[column + k]
-                value1 = w[column + CHUNK + k]
-                value2 = w[column + 2 * CHUNK + k]
-                value3 = w[column + 3 * CHUNK + k]
-                sum00 += factor0 * value0
-                sum01 += factor0 * value1
-                sum02 += factor0 * value2
-                sum03 += factor0 * value3
-                sum10 += factor1 * value0
-                sum11 += factor1 * value1
-                sum12 += factor1 * value2
-                sum13 += factor1 * value3
-            H[i, j] += sum00
-            H[i, j + 1] += sum01
-            H[i, j + 2] += sum02
-            H[i, j + 3] += sum03
-            H[i + 1, j] += sum10
-            H[i + 1, j + 1] += sum11
-            H[i + 1, j + 2] += sum12
-            H[i + 1, j + 3] += sum13
-    squares, _ = add_scores(first, count, w, H[PARAMETERS])
-    H[PARAMETERS, PARAMETERS] += squares
-
-
-@njit(**FAST)
-def add_scores(first, count, w, score):  # type: ignore[no-untyped-def]
-    """Adds a chunk of linearised pixels to score (12), J W r; returns its squared residual and its weight."""
-    count = min(count, CHUNK)
-    first = min(max(first, 0), LARGEST - CHUNK)
-    squares = np.float32(0.0)
-    used = np.float32(0.0)
-    for k in range(count):
-        w[WEIGHTED + k] = w[WEIGHT + first + k] * w[J + 12 * CHUNK + k]
-        squares += w[WEIGHTED + k] * w[J + 12 * CHUNK + k]
-        used += w[WEIGHT + first + k]
-    for i in range(PARAMETERS):
-        row = J + i * CHUNK
-        total = np.float32(0.0)
-        for k in range(count):
-            total += w[WEIGHTED + k] * w[row + k]
-        score[i] += total
-    return squares, used
-
-
-@njit(**FAST)
-def factorise(H, damping, L):  # type: ignore[no-untyped-def]
-    """L L^T = H + damping diag H, L's diagonal as reciprocals; False where that is not positive definite."""
-    for j in range(PARAMETERS):
-        for i in range(j, PARAMETERS):
-            L[i, j] = H[i, j]
-        L[j, j] += (damping + 1e-9) * H[j, j] + 1e-12
-    for j in range(PARAMETERS):
-        if not L[j, j] > 0.0:
-            return False
-        L[j, j] = 1.0 / np.sqrt(L[j, j])
-        for i in range(j + 1, PARAMETERS):
-            L[i, j] *= L[j, j]
-        for k in range(j + 1, PARAMETERS):
-            for i in range(k, PARAMETERS):
-                L[i, k] -= L[i, j] * L[k, j]
-    return True
-
-
-@njit(**FAST)
-def substitute(L, x):  # type: ignore[no-untyped-def]
-    """x becomes (L L^T)^-1 x."""
-    for i in range(PARAMETERS):
-        total = x[i]
-        for k in range(i):
-            total -= L[i, k] * x[k]
-        x[i] = total * L[i, i]
-    for i in range(PARAMETERS - 1, -1, -1):
-        total = x[i]
-        for k in range(i + 1, PARAMETERS):
-            total -= L[k, i] * x[k]
-        x[i] = total * L[i, i]
-
-
-@njit(**FAST)
-def keep_possible(p, smeared):  # type: ignore[no-untyped-def]
+def _keep_possible(p, instants):  # type: ignore[no-untyped-def]
     """Keeps W's variances within bounds and its off-diagonal below what makes it indefinite."""
     p[5] = min(max(p[5], LEAST_BLUR), MOST_BLUR)
-    if smeared:
+    if instants > 1:
         return
     p[7] = min(max(p[7], LEAST_BLUR), MOST_BLUR)
     most = 0.95 * np.sqrt(p[5] * p[7])
@@ -149,40 +57,155 @@ def _is_close(p, step):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def minimise(p, smeared, x0, y0, count, w, H, L):  # type: ignore[no-untyped-def]
-    """Levenberg and Marquardt's steps from p, at which H holds the normal equations.
+def _assess(p, instants, x0, y0, count, w, L, quality):  # type: ignore[no-untyped-def]
+    """Fills quality and takes a small step by the factor at hand; returns its length, the cost before it and the gain.
 
-    Ends with the first step that leaves the normal matrix, which L factors, nearly as it was. p is filled with where
-    it leads. Returns how far the centre went with it [px], infinite where the steps fail, and the cost before it.
+    Variances as independent errors of the residual's size give them, and as the scores summed over blocks
+    of pixels say: compression leaves errors that neighbours share. Pixels that are not quite trusted, at a highlight's
+    edge, may all be off to one side: how far they pull the centre is an error by itself.
     """
     n = PARAMETERS
-    trial = p.copy()
+    pull = np.zeros((2, n))  # rows of H^-1: how the centre follows each score
+    for axis in range(2):
+        pull[axis, axis] = 1.0
+        substitute(L, pull[axis])
+    side = _number_blocks(count, w)
+    blocks = np.zeros((2, side * side))
+    white, doubted = np.zeros(2), np.zeros(2)
+    score = np.zeros(n)
+    cost = 0.0
+    used = 0.0
+    for first in range(0, count, CHUNK):
+        some = filled_up(min(CHUNK, count - first))
+        linearise(p, instants, x0, y0, first, some, w)
+        _add_influence(first, some, w, pull, white, blocks, doubted)
+        squares, weight = add_scores(first, some, w, score)
+        cost += squares
+        used += weight
+    for axis in range(2):
+        shared = 0.0
+        for cell in range(side * side):
+            shared += blocks[axis, cell] ** 2
+        quality[1 + axis] = white[axis]
+        quality[3 + axis] = shared
+        quality[7 + axis] = doubted[axis]
+    step = score.copy()
+    substitute(L, step)
+    gain = 0.0
+    for i in range(n):
+        gain += step[i] * score[i]
+        p[i] += step[i]
+    _keep_possible(p, instants)
+    quality[5] = max(cost - gain, 0.0) / max(used - n, 1.0)
+    quality[6] = used / count
+    return max(abs(step[0]), abs(step[1])), cost, gain
+
+
+@njit(**FAST)
+def _number_blocks(count, w):  # type: ignore[no-untyped-def]
+    """Fills in which block of a square of them each pixel lies; returns how many blocks the square's side has."""
+    count = min(filled_up(count), LARGEST)
+    reach = np.float32(0.0)
+    for k in range(count):
+        away = max(abs(w[X + k]), abs(w[Y + k]))
+        reach = away if away > reach else reach
+    scale, side = np.float32(1.0 / BLOCK), 2 * int(reach) // BLOCK + 2
+    width = np.float32(side)
+    for k in range(count):
+        row, column = np.floor((w[Y + k] + reach) * scale), np.floor((w[X + k] + reach) * scale)
+        w[BLOCK_OF + k] = row * width + column
+    return side
+
+
+@njit(**FAST)
+def _add_influence(first, count, w, pull, white, blocks, doubted):  # type: ignore[no-untyped-def]
+    """Each pixel's weight in the centre, squared, and times its residual, summed by block and over doubted ones."""
+    count = min(count, CHUNK)
+    first = min(max(first, 0), LARGEST - CHUNK)
+    for axis in range(2):
+        influence = WEIGHTED + axis * CHUNK
+        w[influence : influence + count] = np.float32(0.0)
+        for i in range(0, PARAMETERS, 4):  # four rows at once: what is filled is loaded and stored less often
+            row = J + i * CHUNK
+            factor0, factor1 = np.float32(pull[axis, i]), np.float32(pull[axis, i + 1])
+            factor2, factor3 = np.float32(pull[axis, i + 2]), np.float32(pull[axis, i + 3])
+            for k in range(count):
+                value0, value1 = w[row + k], w[row + CHUNK + k]
+                value2, value3 = w[row + 2 * CHUNK + k], w[row + 3 * CHUNK + k]
+                w[influence + k] += factor0 * value0 + factor1 * value1 + factor2 * value2 + factor3 * value3
+        total = np.float32(0.0)
+        pulled = np.float32(0.0)
+        for k in range(count):
+            w[influence + k] *= w[WEIGHT + first + k]
+            total += w[influence + k] * w[influence + k]
+            w[influence + k] *= w[J + 12 * CHUNK + k]
+            pulled += w[influence + k] if w[WEIGHT + first + k] < np.float32(DOUBTED) else np.float32(0.0)
+        white[axis] += total
+        doubted[axis] += pulled
+    for k in range(count):
+        block = int(w[BLOCK_OF + first + k])
+        blocks[0, block] += w[WEIGHTED + k]
+        blocks[1, block] += w[WEIGHTED + CHUNK + k]
+
+
+@njit(**FAST)
+def _is_last(length, gain, cost, count):  # type: ignore[no-untyped-def]
+    """Whether the step after this one would not be worth its while."""
+    return (length < SETTLED and gain < WORTH * cost) or gain * count < WORTHLESS * cost
+
+
+@njit(**FAST)
+def minimise(p, instants, x0, y0, count, w, H, L, quality):  # type: ignore[no-untyped-def]
+    """Levenberg and Marquardt's steps from p, which is filled with the result, as is quality; False where they fail.
+
+    H holds the normal equations at p. A step that leaves the normal matrix nearly as it was is followed by another with
+    the same factor, from the look at the pixels that `quality` takes: mostly the last.
+    """
+    n = PARAMETERS
+    trial, settled = p.copy(), p.copy()
     step = np.zeros(n)
     damping = 1e-3
-    best = np.inf
+    best = length = np.inf
     for attempt in range(40):
         if attempt > 0:
-            normal_equations(trial, smeared, x0, y0, count, w, H)
+            normal_equations(trial, instants, x0, y0, count, w, H)
         cost = H[n, n]
         if not cost < np.inf:
-            return np.inf, best
-        if cost <= best * (1.0 + 1e-6):
-            best = cost
-            p[:] = trial
-            for i in range(n):
-                step[i] = H[n, i]
-            damping = max(0.1 * damping, 1e-7)
-            if not factorise(H, damping, L):
-                return np.inf, best
-            substitute(L, step)
-        else:  # back, and less far
+            return False
+        if cost > best * (1.0 + 1e-6):  # back, and less far
             damping = max(30.0 * damping, 1e-3)
             if damping > 1e4:
-                return np.inf, best
+                break
             step *= 0.2
+            trial[:] = p + step
+            _keep_possible(trial, instants)
+            continue
+        best = cost
+        p[:] = trial
+        damping = max(0.1 * damping, 1e-7)
+        for i in range(n):
+            step[i] = H[n, i]
+        if not factorise(H, damping, L):
+            return False
+        substitute(L, step)
+        gain = 0.0
+        for i in range(n):
+            gain += step[i] * H[n, i]
         trial[:] = p + step
-        keep_possible(trial, smeared)
-        if damping < LITTLE and _is_close(p, step):
+        _keep_possible(trial, instants)
+        length = max(abs(step[0]), abs(step[1]))
+        last = _is_last(length, gain, best, count)
+        if not (damping < LITTLE and (last or _is_close(p, step))):
+            continue
+        settled[:] = trial
+        length, cost, gain = _assess(trial, instants, x0, y0, count, w, L, quality)
+        if cost < best * (1.0 + LEVEL) and (last or _is_last(length, gain, cost, count)):
             p[:] = trial
-            return max(abs(step[0]), abs(step[1])), best
-    return np.inf, best
+            return True
+        trial[:] = settled
+    # Where rounding hides what is left to gain, or along what the pixels hardly tell.
+    normal_equations(p, instants, x0, y0, count, w, H)
+    if not factorise(H, MUCH, L):
+        return False
+    length, cost, gain = _assess(p, instants, x0, y0, count, w, L, quality)
+    return _is_last(length, gain, cost, count)

@@ -5,6 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 
 from tracking.artificial import Scene, draw, expose
+from tracking.disc import CHUNK, PARAMETERS, SCRATCH, J, X, Y, filled_up, linearise
 from tracking.dots import Dots, fit_dots, start_of
 
 SIDE = 64
@@ -48,6 +49,36 @@ def test_the_fast_fit_is_the_plain_one() -> None:
     np.testing.assert_allclose(plain.x[:2], dots.centre[0], atol=6e-3)
     np.testing.assert_allclose(plain.x[2:5], dots.parameters[0, 2:5], atol=6e-4)
     assert plain.x[8] == pytest.approx(dots.contrast[0], rel=0.01)
+
+
+def test_derivatives_are_the_plain_models() -> None:
+    """By every parameter of a small, blurred and slightly flattened dot, where the edge is as wide as the dot."""
+    p = np.array([0.2, -0.3, 0.42, 0.03, 0.38, 2.6, 0.2, 2.3, -110.0, 170.0, 1e-3, -2e-3])
+    y, x = np.mgrid[-7:8, -7:8].reshape(2, -1).astype(float)
+    w = np.zeros(SCRATCH, np.float32)
+    w[X : X + len(x)], w[Y : Y + len(y)] = x, y
+    linearise(p, 1, 0, 0, 0, filled_up(len(x)), w)
+    for k in range(PARAMETERS):
+        h = 1e-3 * max(abs(p[k]), 0.1)
+        up, down = (plain_level(p + side * h * np.eye(PARAMETERS)[k], x, y) for side in (1, -1))
+        row, plain = w[J + k * CHUNK : J + k * CHUNK + len(x)], (up - down) / (2 * h)
+        assert np.linalg.norm(row - plain) < 0.12 * np.linalg.norm(plain), k
+
+
+@pytest.mark.parametrize(("noise", "least"), [(0.0, 0.98), (2.0, 0.98), (8.0, 0.85)])
+def test_small_blurred_dots_are_fitted(noise: float, least: float) -> None:
+    """Radius 3 and half a pixel off its start, flattened up to two to one, out of focus, in the middle of a motion."""
+    random = np.random.default_rng(8)
+    scene = Scene(size=(SIDE, SIDE), noise=noise, blur=1.5, slope=0.15, fine=4)
+    errors = []
+    for _ in range(60):
+        x, y = 32 + random.uniform(-0.5, 0.5, 2)
+        ellipse = (x, y, 3.0, random.uniform(1.5, 3.0), random.uniform(0, np.pi))
+        image = filmed(ellipse, scene, int(random.integers(1000)), tuple(random.uniform(-1.2, 1.2, 2)))
+        dots = fitted(image, x + random.uniform(-0.5, 0.5), y + random.uniform(-0.5, 0.5), 3.0)
+        errors.append(np.abs(dots.centre[0] - (x, y)).max() if np.isfinite(dots.sigma[0, 0]) else np.nan)
+    assert np.isfinite(errors).mean() >= least
+    assert np.nanmedian(errors) < 0.01 + 0.02 * noise
 
 
 @pytest.mark.parametrize(
