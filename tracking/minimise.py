@@ -165,7 +165,7 @@ def minimise(p, instants, x0, y0, count, w, H, L, quality):  # type: ignore[no-u
     trial, settled = p.copy(), p.copy()
     step = np.zeros(n)
     damping = 1e-3
-    best = length = np.inf
+    best = np.inf
     for attempt in range(40):
         if attempt > 0:
             normal_equations(trial, instants, x0, y0, count, w, H)

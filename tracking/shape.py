@@ -269,7 +269,7 @@ def _with_marks(
     match = np.where(gap < STILL * pattern.spacing, nearest, -1)
     moving, free = np.flatnonzero(match < 0), np.setdiff1d(np.arange(len(dots)), match)
     marks = len(match) - len(moving)
-    if not marks or not len(moving) or not len(free):
+    if not marks or len(moving) < 2 or not len(free):  # one alone has no shape
         return match, float(marks)
     body, own = Pattern.of(pattern.rest[moving]), expected[moving]
     search = _Search.of(body, dots[free])

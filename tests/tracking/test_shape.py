@@ -41,6 +41,16 @@ def test_hidden_dots_and_false_ones(random: np.random.Generator) -> None:
     np.testing.assert_array_equal(shown[match[match >= 0]], np.flatnonzero(match >= 0))
 
 
+@pytest.mark.parametrize("away", [1, 2, 3])
+def test_all_but_a_few_keep_still(away: int) -> None:
+    """Only what is beside the body's end has moved, to where none of it can be: nobody takes another's dot."""
+    dots = grid()
+    dots[:away] += [0.0, 700.0]
+    match = recognise(Pattern.of(grid()), grid(), grid(), np.zeros(27), dots, 2.2, 1.0, np.zeros(27))
+    np.testing.assert_array_equal(match[away:], np.arange(away, 27))
+    assert (match[:away] < 0).all()
+
+
 def curled(turn: float) -> np.ndarray:
     """Nine pairs of markers; from the third on each turns on by that much."""
     angle = np.cumsum([0.0, 0.0, 0.0, *[turn] * 6])
