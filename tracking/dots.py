@@ -19,11 +19,12 @@ Array = NDArray[Any]
 RADII = (3.0, 32.0)  # of the dots looked for [px]
 FLATTEST = 0.4  # least ratio of the axes
 ROUNDEST = 0.75  # least share of the outline's ellipse that is filled
+VAGUEST = 0.2  # share of a radius: as much as a fit's own uncertainty of it may excuse
 LEAST_CONTRAST = 12.0  # grey levels
 LEAST_SIGMA = 1e-3  # px: below it the model's own error counts
 SHARED_NOISE = 1.25  # variance by blocks over that by independent errors, beyond which errors are shared
 ENOUGH_FOR_TWO = 64  # dots, to fit half of them in another thread; with fewer, decoding takes longer than fitting
-FIGURES = 8  # of a dot, that follow from its fit
+FIGURES = 9  # of a dot, that follow from its fit
 SAME_PLACE = 0.6  # radii: two dots closer than this are one
 SPOT_SHARE = 0.3  # of the markers' contrast: what a spot must stand out by
 
@@ -41,6 +42,7 @@ class Dots:
             quite trusted pull [px], (D, 2); NaN where the fit failed.
         parameters: of the fitted discs, see `tracking.disc`, (D, 12).
         radius: geometric mean of the semi-axes [px], (D).
+        vague: standard deviation of the radius, as a share of it; large for small dots out of focus, (D).
         flattening: ratio of the axes, 1 for a circle, (D).
         contrast: of the dot against its surroundings, negative for dark dots [grey levels], (D).
         leverage: what a grey level of independent noise in every pixel moves the centre by [px], (D, 2).
@@ -52,6 +54,7 @@ class Dots:
     sigma: Array
     parameters: Array
     radius: Array
+    vague: Array
     flattening: Array
     contrast: Array
     leverage: Array
@@ -69,7 +72,7 @@ class Dots:
         """As many dots that are not there."""
         nan = np.full(count, np.nan)
         pair = np.full((count, 2), np.nan)
-        return cls(pair, pair.copy(), np.full((count, PARAMETERS), np.nan), nan, nan, nan, pair.copy(), nan, nan)
+        return cls(pair, pair.copy(), np.full((count, PARAMETERS), np.nan), nan, nan, nan, nan, pair.copy(), nan, nan)
 
 
 @njit(cache=True, nogil=True)
@@ -96,10 +99,10 @@ def _fit_some(image, start, first, last, fitted, figures):  # type: ignore[no-un
 
 @njit(cache=True, nogil=True)
 def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
-    """Fills what `Dots` says of one fit: sigma (2), leverage (2), radius, flattening, residual, share used."""
+    """Fills what `Dots` says of one fit: sigma (2), leverage (2), radius, flattening, residual, used, vague."""
     figures[0:2] = np.nan
     figures[2], figures[3] = np.sqrt(quality[1]), np.sqrt(quality[2])
-    figures[4], figures[5] = np.nan, 0.0
+    figures[4], figures[5], figures[8] = np.nan, 0.0, np.nan
     figures[6], figures[7] = np.sqrt(quality[5]) / max(abs(p[8]), 1e-12), quality[6]
     determinant = p[2] * p[4] - p[3] * p[3]
     mean = 0.5 * (p[2] + p[4])
@@ -111,6 +114,7 @@ def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
     figures[1] = np.sqrt((quality[4] if shared else white_y) + quality[8] ** 2 + LEAST_SIGMA**2)
     spread = np.sqrt(max(mean * mean - determinant, 0.0))
     figures[4] = 1.0 / np.sqrt(determinant)
+    figures[8] = np.sqrt(quality[9] * quality[5]) / mean
     figures[5] = (mean - spread) / (mean + spread)
 
 
@@ -129,6 +133,7 @@ def fit_dots(image: NDArray, start: Array, wanted: int | None = None) -> Dots:
         sigma=figures[:, :2],
         parameters=fitted,
         radius=figures[:, 4],
+        vague=figures[:, 8],
         flattening=figures[:, 5],
         contrast=fitted[:, 8],
         leverage=figures[:, 2:4],
@@ -226,7 +231,8 @@ def find_dots(image: NDArray, dark: bool) -> Dots:
     """All dots of a picture that a disc fits."""
     dots = fit_dots(image, candidates(image, dark))
     good = np.isfinite(dots.sigma[:, 0]) & (dots.flattening > FLATTEST) & (dots.residual < 0.25)
-    good &= (dots.radius > RADII[0] - 1) & (dots.radius < RADII[1] + 1) & (dots.used > 0.5)
+    largest = dots.radius * (1.0 + 2.0 * np.minimum(dots.vague, VAGUEST))
+    good &= (largest > RADII[0] - 1) & (dots.radius < RADII[1] + 1) & (dots.used > 0.5)
     good &= (np.abs(dots.contrast) > LEAST_CONTRAST) & ((dots.contrast < 0) == dark)
     good &= (dots.centre > 0).all(axis=1) & (dots.centre < np.array(image.shape[::-1]) - 1).all(axis=1)
     return dots[good]

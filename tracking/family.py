@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tracking.dots import LEAST_CONTRAST, Dots, find_dots
+from tracking.dots import LEAST_CONTRAST, VAGUEST, Dots, find_dots
 
 SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
@@ -29,17 +29,17 @@ class Family:
 
     def admits(self, dots: Dots) -> NDArray[np.bool_]:
         """Which dots could be markers of this family, (D)."""
-        figures = dots.radius, dots.flattening, dots.contrast, dots.residual, dots.used, dots.sigma
+        figures = dots.radius, dots.vague, dots.flattening, dots.contrast, dots.residual, dots.used, dots.sigma
         return _admitted(self.radius, self.contrast, *figures)
 
 
 @njit(cache=True)
-def _admitted(usual_radius, usual_contrast, radius, flattening, contrast, residual, used, sigma):  # type: ignore[no-untyped-def]
+def _admitted(usual_radius, usual_contrast, radius, vague, flattening, contrast, residual, used, sigma):  # type: ignore[no-untyped-def]
     good = np.empty(len(radius), np.bool_)
     for k in range(len(radius)):
         ratio = contrast[k] / usual_contrast
         good[k] = (
-            abs(np.log(radius[k] / usual_radius)) < np.log(1.35)
+            abs(np.log(radius[k] / usual_radius)) < np.log(1.35) + 2.0 * min(vague[k], VAGUEST)
             and flattening[k] > 0.45
             and 0.3 < ratio < 3.0
             and abs(contrast[k]) > LEAST_CONTRAST
@@ -53,7 +53,8 @@ def _admitted(usual_radius, usual_contrast, radius, flattening, contrast, residu
 
 def _kin(dots: Dots) -> Dots:
     """Those that are like most in size, contrast and fit taken together: a blot is a little off in all."""
-    unlike = (np.log(dots.radius / np.median(dots.radius)) / 0.12) ** 2
+    vague = np.minimum(dots.vague, VAGUEST)
+    unlike = np.log(dots.radius / np.median(dots.radius)) ** 2 / (0.12**2 + vague**2)
     unlike += (np.log(dots.contrast / np.median(dots.contrast)) / 0.35) ** 2
     worse = dots.residual - np.median(dots.residual)
     unlike += (np.maximum(worse, 0.0) / max(0.5 * float(np.median(dots.residual)), 0.02)) ** 2
@@ -70,7 +71,8 @@ def find_family(image: NDArray) -> tuple[Family, Dots] | None:
         sigma = dots.sigma.max(axis=1)
         quality = 1.0 / (1.0 + (sigma / SHARP) ** 2) ** 2
         for seed in range(len(dots)):
-            alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2)
+            vague = np.minimum(dots.vague + dots.vague[seed], VAGUEST)
+            alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2) + 2.0 * vague
             alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)
             score = float(quality[alike].sum())
             if best is None or score > best[0]:

@@ -22,8 +22,9 @@ from tracking.disc import (
 from tracking.normal_equations import add_scores, factorise, normal_equations, substitute
 
 # Converged; the centre's variances by independent errors of one grey level (2), by blocks (2); mean squared residual;
-# share used; how far the pixels that are not quite trusted pull the centre (2).
-QUALITY = 9
+# share used; how far the pixels that are not quite trusted pull the centre (2); the variance of A's mean diagonal by
+# independent errors of one grey level.
+QUALITY = 10
 # Steps that leave the normal matrix nearly as it was: of the centre and of the radius [px], and the share by which the
 # contrast and the edge's variance may change.
 CLOSE, SWELLING, CHANGE = 1.0, 0.3, 0.05
@@ -66,9 +67,12 @@ def _assess(p, instants, x0, y0, count, w, L, quality):  # type: ignore[no-untyp
     """
     n = PARAMETERS
     pull = np.zeros((2, n))  # rows of H^-1: how the centre follows each score
+    size = np.zeros(n)
     for axis in range(2):
         pull[axis, axis] = 1.0
         substitute(L, pull[axis])
+        size[2 + 2 * axis] = 0.5
+    substitute(L, size)
     side = _number_blocks(count, w)
     blocks = np.zeros((2, side * side))
     white, doubted = np.zeros(2), np.zeros(2)
@@ -98,6 +102,7 @@ def _assess(p, instants, x0, y0, count, w, L, quality):  # type: ignore[no-untyp
     _keep_possible(p, instants)
     quality[5] = max(cost - gain, 0.0) / max(used - n, 1.0)
     quality[6] = used / count
+    quality[9] = 0.5 * (size[2] + size[4])
     return max(abs(step[0]), abs(step[1])), cost, gain
 
 
