@@ -1,4 +1,4 @@
-"""Fitting discs to pixels: which pixels to trust, and how sure the centre is."""
+"""Fitting discs to pixels: which pixels to trust, and whether the disc moved far while the shutter was open."""
 
 import numpy as np
 from numba import njit

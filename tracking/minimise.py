@@ -32,7 +32,7 @@ LITTLE = 1e-3  # of the normal matrix' diagonal: damping that changes neither st
 # The centre's last step [px], and what it may be worth as a share of the squared residual: the next is smaller still.
 SETTLED, WORTH = 0.005, 0.01
 WORTHLESS = 0.4  # of a pixel's mean squared residual: a gain that says nothing more about the disc
-MUCH = 0.1  # damping that changes the centre's steps
+MUCH = 0.1  # damping of the last try, that holds back what the pixels hardly tell and leaves the centre its step
 LEVEL = 1e-3  # of the squared residual: as much as before, but for rounding
 DOUBTED = 0.9  # weight: below it a pixel is not quite trusted
 BLOCK = 4  # px: errors closer than this are not taken to be independent
