@@ -84,18 +84,30 @@ def choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
         first, last = max(int(np.ceil(middle - reach)), 0), min(int(np.floor(middle + reach)), width - 1)
         if count + last - first >= LARGEST - CHUNK:
             return 0
+        line = image[row]
         for column in range(first, last + 1):
             r2 = least + along * (column - middle) ** 2
             skipped = ((r2 < inside) | (r2 > outside)) & ((row + column) & 1)
-            for k in range(near.shape[0]):
-                ex, ey = column - near[k, 0], row - near[k, 1]
-                skipped |= ex * ex + ey * ey < (near[k, 2] + 3.0) ** 2
             w[X + count] = column - x0
             w[Y + count] = row - y0
-            w[VALUE + count] = image[row, column]
+            w[VALUE + count] = line[np.uintp(column)]
             count += 1 - skipped  # no branch: where the pattern ends is nothing that a processor can foresee
+    count = _without(near, x0, y0, count, w)
     for k in range(count, filled_up(count)):
         w[X + k] = w[Y + k] = w[VALUE + k] = w[WEIGHT + k] = np.float32(0.0)
+    return count
+
+
+@njit(**FAST)
+def _without(near, x0, y0, count, w):  # type: ignore[no-untyped-def]
+    """Leaves out other dots' pixels; returns how many stay."""
+    for other in range(near.shape[0]):
+        x, y, square = near[other, 0] - x0, near[other, 1] - y0, (near[other, 2] + 3.0) ** 2
+        kept = 0
+        for k in range(count):
+            w[X + kept], w[Y + kept], w[VALUE + kept] = w[X + k], w[Y + k], w[VALUE + k]
+            kept += (w[X + k] - x) ** 2 + (w[Y + k] - y) ** 2 >= square
+        count = kept
     return count
 
 

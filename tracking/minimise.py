@@ -110,12 +110,11 @@ def _assess(p, instants, x0, y0, count, w, L, quality):  # type: ignore[no-untyp
 def _number_blocks(count, w):  # type: ignore[no-untyped-def]
     """Fills in which block of a square of them each pixel lies; returns how many blocks the square's side has."""
     count = min(filled_up(count), LARGEST)
-    reach = np.float32(0.0)
+    most = 0  # a maximum of whole numbers becomes vector instructions, one of floats does not
     for k in range(count):
-        away = max(abs(w[X + k]), abs(w[Y + k]))
-        reach = away if away > reach else reach
-    scale, side = np.float32(1.0 / BLOCK), 2 * int(reach) // BLOCK + 2
-    width = np.float32(side)
+        most = max(most, max(abs(int(w[X + k])), abs(int(w[Y + k]))))
+    scale, side = np.float32(1.0 / BLOCK), 2 * most // BLOCK + 2
+    reach, width = np.float32(most), np.float32(side)
     for k in range(count):
         row, column = np.floor((w[Y + k] + reach) * scale), np.floor((w[X + k] + reach) * scale)
         w[BLOCK_OF + k] = row * width + column

@@ -100,13 +100,11 @@ def factorise(H, damping, L):  # type: ignore[no-untyped-def]
 @njit(**FAST)
 def substitute(L, x):  # type: ignore[no-untyped-def]
     """x becomes (L L^T)^-1 x."""
-    for i in range(PARAMETERS):
-        total = x[i]
-        for k in range(i):
-            total -= L[i, k] * x[k]
-        x[i] = total * L[i, i]
-    for i in range(PARAMETERS - 1, -1, -1):
-        total = x[i]
+    for i in range(PARAMETERS):  # by columns: each step's products do not wait for one another
+        x[i] *= L[i, i]
         for k in range(i + 1, PARAMETERS):
-            total -= L[k, i] * x[k]
-        x[i] = total * L[i, i]
+            x[k] -= L[k, i] * x[i]
+    for i in range(PARAMETERS - 1, -1, -1):
+        x[i] *= L[i, i]
+        for k in range(i):
+            x[k] -= L[i, k] * x[i]
