@@ -32,6 +32,7 @@ LITTLE = 1e-3  # of the normal matrix' diagonal: damping that changes neither st
 # The centre's last step [px], and what it may be worth as a share of the squared residual: the next is smaller still.
 SETTLED, WORTH = 0.005, 0.01
 WORTHLESS = 0.4  # of a pixel's mean squared residual: a gain that says nothing more about the disc
+LONGEST = 0.2  # of the radius' square: what W's variance along a large dot's way may be beyond `MOST_BLUR`
 MUCH = 0.1  # damping of the last try, that holds back what the pixels hardly tell and leaves the centre its step
 LEVEL = 1e-3  # of the squared residual: as much as before, but for rounding
 DOUBTED = 0.9  # weight: below it a pixel is not quite trusted
@@ -41,10 +42,11 @@ BLOCK = 4  # px: errors closer than this are not taken to be independent
 @njit(**FAST)
 def _keep_possible(p, instants):  # type: ignore[no-untyped-def]
     """Keeps W's variances within bounds and its off-diagonal below what makes it indefinite."""
-    p[5] = min(max(p[5], LEAST_BLUR), MOST_BLUR)
+    widest = max(MOST_BLUR, LONGEST / max(p[2] * p[4] - p[3] * p[3], 1e-12))
+    p[5] = min(max(p[5], LEAST_BLUR), widest)
     if instants > 1:
         return
-    p[7] = min(max(p[7], LEAST_BLUR), MOST_BLUR)
+    p[7] = min(max(p[7], LEAST_BLUR), widest)
     most = 0.95 * np.sqrt(p[5] * p[7])
     p[6] = min(max(p[6], -most), most)
 
