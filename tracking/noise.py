@@ -19,7 +19,7 @@ STILL, LAGGING = 0.45, 1.0
 # The share of these errors' variance that all markers have in common: of markers that move far from frame to frame,
 # and how much more where they move less than SLOW of these errors a frame and wait together until the encoder takes
 # notice. Measured likewise.
-COMMON, WAITING, SLOW = 0.05, 0.6, 4.0
+COMMON, WAITING, SLOW = 0.05, 0.6, 5.0
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
 MODES = 12  # of the body's motion, at most
 TELLING = 0.3  # of a fit's variance: an excess smaller than this may be chance
@@ -44,8 +44,8 @@ def places_and_errors(pixel: Array, fitted: Array, leverage: Array, step: Array)
     others = Others.of(pixel, expected)
     if others is None:
         return pixel, expected
-    off, gone = mendable(pixel, fitted, coding, others)
-    return pixel - off, np.sqrt(with_shared_errors(expected, others) ** 2 - gone)
+    off, mended = mendable(pixel, fitted, coding, others)
+    return pixel - off, np.where(np.isnan(mended), with_shared_errors(expected, others), mended)
 
 
 def coding_errors(pixel: Array, leverage: Array, step: Array) -> Array:
@@ -133,10 +133,10 @@ def with_shared_errors(sigma: Array, others: Others) -> Array:
 
 
 def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tuple[Array, Array]:
-    """What of the places is coding's error, by the others' motion [px], and the variances that go with it, (T, D, 2).
+    """What of the places is coding's error, by the others' motion, and standard deviations without it [px], (T, D, 2).
 
-    The best mean of two places of known variances, the measured one and the others'. Zero where nothing is known of
-    the coding. What all markers have in common cannot be seen, and stays.
+    The best mean of two places of known variances, the measured one and the others'. Zero and NaN where nothing is
+    known of the coding. What all markers have in common cannot be seen, and stays.
 
     Args:
         pixel: paths as fitted [px], (T, D, 2).
@@ -151,19 +151,21 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tupl
     way = np.nanmean(np.diff(pixel[:, others.markers], axis=0) ** 2, axis=0).sum(axis=1, keepdims=True)
     waiting = usual / (usual + np.maximum(way - usual, 0.0) / SLOW**2)  # 1 where a marker keeps still, 0 where it flies
     common = COMMON + WAITING * waiting
-    own = np.where(square > 0.0, whole - common * (whole - shown), 0.0)
+    shared = common * (whole - shown)
+    own = np.where(square > 0.0, whole - shared, 0.0)
     # What the others do not tell of the body's motion, and what their errors and its own make of their prediction.
     share = (others.leverage / (1.0 - others.leverage))[..., None]
     least = (others.carried + share) * whole.mean(axis=0)
-    irregular = np.maximum(others.missed - own.mean(axis=0), least)
-    part = own / np.maximum(own + irregular, (others.away / SURPRISING) ** 2)
+    beyond = np.maximum(others.missed - own.mean(axis=0), 0.0)
+    part = own / np.maximum(own + np.maximum(beyond, least), (others.away / SURPRISING) ** 2)
     # Where the others leave less of all paths together than these errors would be, the errors are smaller; but for
     # markers that keep still, whose errors keep still with them and are not seen.
     left = (others.missed / (1.0 + others.carried)).mean(axis=0)
     smaller = np.minimum(left / np.maximum(own.mean(axis=(0, 1)), 1e-12), 1.0)
     smaller = waiting + (1.0 - waiting) * smaller
-    irregular = np.maximum(others.missed - smaller * own.mean(axis=0), smaller * least)
-    rest = smaller * (whole - own + (1.0 - part) ** 2 * own) + part**2 * irregular
-    off, gone = np.zeros((2, *pixel.shape))
-    off[where], gone[where] = part * others.away, np.where(square > 0.0, whole - rest, 0.0)
-    return off, gone
+    # What a path has beyond them may be its own motion, where it was drawn away from it, or error, where it was not.
+    kept = (1.0 - part) ** 2 * (smaller * own + beyond)
+    rest = smaller * shared + kept + part**2 * np.maximum(beyond, smaller * least)
+    off, mended = np.zeros(pixel.shape), np.full(pixel.shape, np.nan)
+    off[where], mended[where] = part * others.away, np.where(square > 0.0, np.sqrt(rest), np.nan)
+    return off, mended
