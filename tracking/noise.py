@@ -17,8 +17,8 @@ Array = NDArray[Any]
 # dots of 8 px, medium preset; of quicker ones the decoding tells larger steps.
 STILL, LAGGING = 0.45, 1.0
 # The share of these errors' variance that all markers have in common: of markers that move far from frame to frame,
-# and how much more where they move less than SLOW of these errors a frame and wait together until the encoder takes
-# notice. Measured likewise.
+# and how much more before and after frames to which they move less than SLOW of these errors: where they turn round,
+# they wait together until the encoder takes notice. Measured likewise.
 COMMON, WAITING, SLOW = 0.05, 0.6, 5.0
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
 MODES = 12  # of the body's motion, at most
@@ -148,7 +148,8 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tupl
     square, shown = coding[where] ** 2, fitted[where] ** 2
     whole = np.maximum(square, shown)
     usual = np.maximum(square.mean(axis=0), 1e-12).sum(axis=1, keepdims=True)
-    way = np.nanmean(np.diff(pixel[:, others.markers], axis=0) ** 2, axis=0).sum(axis=1, keepdims=True)
+    way = np.pad((np.diff(pixel, axis=0) ** 2).sum(axis=2), ((1, 1), (0, 0)), constant_values=np.nan)
+    way = np.nan_to_num(np.fmax(way[:-1], way[1:])[where])[..., None]  # to this frame or the next
     waiting = usual / (usual + np.maximum(way - usual, 0.0) / SLOW**2)  # 1 where a marker keeps still, 0 where it flies
     common = COMMON + WAITING * waiting
     shared = common * (whole - shown)

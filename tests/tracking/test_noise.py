@@ -59,6 +59,20 @@ def test_the_others_mend_what_coding_moved(random: np.random.Generator, error: f
     assert np.sqrt(np.mean(sigma**2)) == pytest.approx(off, rel=0.2)
 
 
+def test_markers_that_turn_round_wait_together(random: np.random.Generator) -> None:
+    """All lag where they hardly move, which is a motion of their own; the others cannot tell it from the body's."""
+    speed = np.cos(0.45 * np.arange(200))
+    reach = random.uniform(1.0, 1.5, 20)
+    truth = np.zeros((200, 20, 2))
+    truth[..., 1] = 3.0 * reach * np.sin(0.45 * np.arange(200))[:, None]
+    turning = np.abs(speed) < 0.1
+    pixel = truth + random.normal(size=truth.shape) * 0.1
+    pixel[turning, :, 1] -= 0.25 * reach * np.sign(speed[turning, None])
+    place, sigma = coded(pixel, 0.15)
+    assert np.mean(np.abs(place - truth) > 4.0 * sigma) < 0.005
+    assert np.median(sigma[np.abs(speed) > 0.5]) < 0.8 * np.median(sigma[turning])
+
+
 def test_a_marker_that_moves_on_its_own_stays_where_it_was_seen(random: np.random.Generator) -> None:
     """One that trembles all the time, by ten times the error expected, and one that is jerked once."""
     pixel = paths(random, np.full(20, 0.05))
