@@ -167,6 +167,8 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tupl
     # What a path has beyond them may be its own motion, where it was drawn away from it, or error, where it was not.
     kept = (1.0 - part) ** 2 * (smaller * own + beyond)
     rest = smaller * shared + kept + part**2 * np.maximum(beyond, smaller * least)
+    # A place that stays farther from where the others put it may be error as well.
+    rest = np.maximum(rest, ((1.0 - part) * others.away / SURPRISING) ** 2)
     off, mended = np.zeros(pixel.shape), np.full(pixel.shape, np.nan)
     off[where], mended[where] = part * others.away, np.where(square > 0.0, np.sqrt(rest), np.nan)
     return off, mended
