@@ -64,8 +64,12 @@ class Dots:
     def __len__(self) -> int:
         return len(self.centre)
 
-    def __getitem__(self, rows: NDArray) -> "Dots":
+    def __getitem__(self, rows: NDArray | slice) -> "Dots":
         return Dots(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def beside(self, more: "Dots") -> "Dots":
+        """These and more."""
+        return Dots(*(np.concatenate([getattr(self, name), getattr(more, name)]) for name in self.__dataclass_fields__))
 
     @classmethod
     def none(cls, count: int) -> "Dots":
@@ -76,7 +80,7 @@ class Dots:
 
 
 @njit(cache=True, nogil=True)
-def _fit_some(image, start, first, last, fitted, figures):  # type: ignore[no-untyped-def]
+def _fit_some(image, start, first, last, wary, fitted, figures):  # type: ignore[no-untyped-def]
     """Fit starts first to last of start (D, 12); fills fitted (D, 12) and figures (D, FIGURES)."""
     count = start.shape[0]
     room = np.empty(SCRATCH, np.float32)
@@ -93,7 +97,7 @@ def _fit_some(image, start, first, last, fitted, figures):  # type: ignore[no-un
                 near[found, 1] = start[other, 1]
                 near[found, 2] = radius[other]
                 found += 1
-        fit_disc(image, fitted[k], near[:found], room, quality)
+        fit_disc(image, fitted[k], near[:found], wary, room, quality)
         _describe(fitted[k], quality, figures[k])
 
 
@@ -118,14 +122,17 @@ def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
     figures[5] = (mean - spread) / (mean + spread)
 
 
-def fit_dots(image: NDArray, start: Array, wanted: int | None = None) -> Dots:
-    """Fit a disc to every start (D, 12), see `tracking.disc`, or to the first ones wanted, beside the others."""
+def fit_dots(image: NDArray, start: Array, wanted: int | None = None, wary: bool = True) -> Dots:
+    """Fit a disc to every start (D, 12), see `tracking.disc`, or to the first ones wanted, beside the others.
+
+    A wary fit knows highlights by what the start does not explain, so it needs a good one.
+    """
     start = np.ascontiguousarray(start)
     count = len(start) if wanted is None else wanted
     fitted, figures = np.empty((count, PARAMETERS)), np.empty((count, FIGURES))
     half = count // 2 if count >= ENOUGH_FOR_TWO else 0
-    other = _POOL.submit(_fit_some, image, start, 0, half, fitted, figures) if half else None
-    _fit_some(image, start, half, count, fitted, figures)
+    other = _POOL.submit(_fit_some, image, start, 0, half, wary, fitted, figures) if half else None
+    _fit_some(image, start, half, count, wary, fitted, figures)
     if other is not None:
         other.result()
     return Dots(
@@ -229,13 +236,25 @@ def _extents(labels, count):  # type: ignore[no-untyped-def]
 
 def find_dots(image: NDArray, dark: bool) -> Dots:
     """All dots of a picture that a disc fits."""
-    dots = fit_dots(image, candidates(image, dark))
+    return dots_at(image, candidates(image, dark), dark)
+
+
+def dots_at(image: NDArray, start: Array, dark: bool) -> Dots:
+    """Those of these candidates (D, 12) that a disc fits, with all their pixels or without what is strange."""
+    plain = fit_dots(image, start, wary=False)
+    good = _are_sound(image, plain, dark)
+    others = np.concatenate([start[~good], start[good]])
+    wary = fit_dots(image, others, int((~good).sum()))
+    return plain[good].beside(wary[_are_sound(image, wary, dark)])
+
+
+def _are_sound(image: NDArray, dots: Dots, dark: bool) -> NDArray[np.bool_]:
     good = np.isfinite(dots.sigma[:, 0]) & (dots.flattening > FLATTEST) & (dots.residual < 0.25)
     largest = dots.radius * (1.0 + 2.0 * np.minimum(dots.vague, VAGUEST))
     good &= (largest > RADII[0] - 1) & (dots.radius < RADII[1] + 1) & (dots.used > 0.5)
     good &= (np.abs(dots.contrast) > LEAST_CONTRAST) & ((dots.contrast < 0) == dark)
     good &= (dots.centre > 0).all(axis=1) & (dots.centre < np.array(image.shape[::-1]) - 1).all(axis=1)
-    return dots[good]
+    return good
 
 
 def apart(dots: Dots, nearest: float) -> Dots:

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tracking.dots import LEAST_CONTRAST, VAGUEST, Dots, find_dots
+from tracking.dots import LEAST_CONTRAST, SAME_PLACE, VAGUEST, Dots, apart, candidates, dots_at, fit_dots
 
 SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
@@ -51,21 +51,27 @@ def _admitted(usual_radius, usual_contrast, radius, vague, flattening, contrast,
     return good
 
 
-def _kin(dots: Dots) -> Dots:
-    """Those that are like most in size, contrast and fit taken together: a blot is a little off in all."""
+def _are_located(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
+    """Which are located about as well as the usual."""
+    return dots.sigma.max(axis=1) < max(5.0 * float(np.median(usual.sigma.max(axis=1))), 0.05)
+
+
+def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
+    """Which are like the usual in size, contrast and fit taken together: a blot is a little off in all."""
     vague = np.minimum(dots.vague, VAGUEST)
-    unlike = np.log(dots.radius / np.median(dots.radius)) ** 2 / (0.12**2 + vague**2)
-    unlike += (np.log(dots.contrast / np.median(dots.contrast)) / 0.35) ** 2
-    worse = dots.residual - np.median(dots.residual)
-    unlike += (np.maximum(worse, 0.0) / max(0.5 * float(np.median(dots.residual)), 0.02)) ** 2
-    return dots[unlike < UNLIKE**2]
+    unlike = np.log(dots.radius / np.median(usual.radius)) ** 2 / (0.12**2 + vague**2)
+    unlike += (np.log(dots.contrast / np.median(usual.contrast)) / 0.35) ** 2
+    residual = float(np.median(usual.residual))
+    unlike += (np.maximum(dots.residual - residual, 0.0) / max(0.5 * residual, 0.02)) ** 2
+    return unlike < UNLIKE**2
 
 
 def find_family(image: NDArray) -> tuple[Family, Dots] | None:
     """The markers of a picture: the largest set of well-located dots alike in size and contrast."""
-    best: tuple[float, Family, Dots] | None = None
+    best: tuple[float, Family, Dots, NDArray] | None = None
     for dark in (True, False):
-        dots = find_dots(image, dark)
+        start = candidates(image, dark)
+        dots = dots_at(image, start, dark)
         dots = dots[(dots.residual < 0.15) & (dots.flattening > 0.5)]
         # A printed dot is located ten times as well as a blot that happens to be round.
         sigma = dots.sigma.max(axis=1)
@@ -76,7 +82,20 @@ def find_family(image: NDArray) -> tuple[Family, Dots] | None:
             alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)
             score = float(quality[alike].sum())
             if best is None or score > best[0]:
-                members = _kin(dots[alike & (sigma < max(5.0 * float(np.median(sigma[alike])), 0.05))])
+                members = dots[alike & _are_located(dots, dots[alike])]
+                members = members[_are_kin(members, members)]
                 family = Family(dark, float(np.median(members.radius)), float(np.median(members.contrast)))
-                best = (score, family, members)
-    return None if best is None else (best[1], best[2])
+                best = (score, family, members, start)
+    return None if best is None else (best[1], _with_relatives(image, *best[1:]))
+
+
+def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArray) -> Dots:
+    """The members and the candidates (D, 12) that are some after all, fitted anew from what the members look like."""
+    gaps = np.linalg.norm(start[:, None, :2] - members.centre, axis=2)
+    left = start[gaps.min(axis=1) > SAME_PLACE * family.radius]
+    left[:, 2:9] = np.median(members.parameters[:, 2:9], axis=0)
+    anew = fit_dots(image, np.concatenate([members.parameters, left]))
+    first, more = anew[: len(members)], anew[len(members) :]
+    good, more = family.admits(first), more[family.admits(more)]
+    more = more[_are_kin(more, members) & _are_located(more, members)]
+    return apart(first[good].beside(members[~good]).beside(more), SAME_PLACE * family.radius)

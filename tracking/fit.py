@@ -9,9 +9,12 @@ from tracking.disc import (
     LARGEST,
     PARAMETERS,
     RESIDUAL,
+    SHOWN,
     SIZE,
     WEIGHT,
     J,
+    X,
+    Y,
     choose_pixels,
     filled_up,
     instants_of,
@@ -22,32 +25,72 @@ from tracking.minimise import minimise
 from tracking.normal_equations import add_products, normal_equations
 
 OUTLYING = 0.12  # of the contrast: a pixel farther off than this shows something else than the dot
-STRANGE = 0.25  # of the contrast: a level this far from what the start expects
+STRANGE = 0.2  # of the contrast: a level this far from what the start expects
+FEW = 0.01  # of the pixels: so many may look strange by noise
+LITTLE = 0.3  # weight
+BESIDE = 1.2  # standard deviations of the edge: what shows something else is blurred as well
 LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edge does not describe any more
 
 
 @njit(**FAST)
-def _reweight(count, w):  # type: ignore[no-untyped-def]
-    """Less weight to pixels far off, by the median of the residuals' size; returns the largest change."""
+def _reweight(p, instants, x0, y0, count, strange, w):  # type: ignore[no-untyped-def]
+    """Less weight to pixels far off, by the median of the residuals' size; returns the largest change.
+
+    None at all to those that show something strange, and beside them.
+    """
     count = min(count, LARGEST)
     for k in range(count):
         w[SIZE + k] = abs(w[RESIDUAL + k])
     scale = np.float32(1.4826) * np.median(w[SIZE : SIZE + count]) + np.float32(0.3)
+    w[SHOWN : SHOWN + count] = np.float32(1.0)
+    if strange:
+        for first in range(0, count, CHUNK):
+            linearise(p, instants, x0, y0, first, filled_up(min(CHUNK, count - first)), w)
+            _weigh_levels(first, min(CHUNK, count - first), p[8], w)
+        _widen(BESIDE * np.sqrt(0.5 * (p[5] + p[5 if instants > 1 else 7])), count, w)
     change = np.float32(0.0)
     for k in range(count):
         z = w[RESIDUAL + k] / (np.float32(4.0) * scale)
-        new = np.float32(1.0) / (np.float32(1.0) + z * z * z * z)
+        new = w[SHOWN + k] / (np.float32(1.0) + z * z * z * z)
         change = max(change, abs(new - w[WEIGHT + k]))
         w[WEIGHT + k] = new
     return change
 
 
 @njit(**FAST)
-def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
+def _widen(reach, count, w):  # type: ignore[no-untyped-def]
+    """Takes all weight by the level shown from pixels within reach [px] of those that have little."""
+    count = min(count, LARGEST)
+    square = np.float32(reach * reach)
+    few = 0
+    for k in range(count):
+        if w[SHOWN + k] < np.float32(LITTLE):
+            w[SIZE + few] = k
+            few += 1
+    for item in range(few):
+        k = int(w[SIZE + item])
+        x, y = w[X + k], w[Y + k]
+        for other in range(count):
+            near = (w[X + other] - x) ** 2 + (w[Y + other] - y) ** 2 < square
+            w[SHOWN + other] = np.float32(0.0) if near else w[SHOWN + other]
+
+
+@njit(**FAST)
+def fit_disc(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
     """Fit a disc from the start p (12), which is filled with the result, as is quality (QUALITY).
 
-    near (K, 3): centre and radius of other dots. w (SCRATCH), float32, is room to work in.
+    near (K, 3): centre and radius of other dots. wary: of pixels that the start does not explain. w (SCRATCH), float32,
+    is room to work in.
     """
+    start = p.copy()
+    if _fit(image, p, near, wary, w, quality):  # the start may be what is strange
+        p[:] = start
+        _fit(image, p, near, False, w, quality)
+
+
+@njit(**FAST)
+def _fit(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
+    """One try of `fit_disc`; True where it fails and some pixels were distrusted."""
     n = PARAMETERS
     quality[:] = 0.0
     H = np.empty((n + 1, n + 1))
@@ -63,12 +106,12 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
         x0, y0 = int(np.rint(p[0])), int(np.rint(p[1]))
         count = choose_pixels(image, p, near, w)
         if count < 3 * n:
-            return
-        strange = _distrust(p, x0, y0, count, w, H)
+            return False
+        strange = _distrust(p, x0, y0, count, wary, w, H)
         if not minimise(p, instants, x0, y0, count, w, H, L, quality):
-            return
+            return strange
         if not (left < p[0] < right and top < p[1] < bottom):
-            return
+            return strange
         if abs(p[0] - x0) < 1.5 and abs(p[1] - y0) < 1.5:
             break
     spread = np.sqrt(0.25 * (p[5] - p[7]) ** 2 + p[6] * p[6])
@@ -83,52 +126,59 @@ def fit_disc(image, p, near, w, quality):  # type: ignore[no-untyped-def]
             normal_equations(p, instants, x0, y0, count, w, H)
     if strange or _count_beyond(OUTLYING * abs(p[8]), count, w) > 0:
         for _ in range(6):
-            change = _reweight(count, w)
+            change = _reweight(p, instants, x0, y0, count, strange, w)
             normal_equations(p, instants, x0, y0, count, w, H)
             if not minimise(p, instants, x0, y0, count, w, H, L, quality):
-                return
+                return strange
             if change < 0.1:
                 break
     if instants > 1:  # back to W, from which another fit may start
         p[5], p[6], p[7] = p[5] + p[6] ** 2 / 12.0, p[6] * p[7] / 12.0, p[5] + p[7] ** 2 / 12.0
     quality[0] = 1.0
+    return False
 
 
 @njit(**FAST)
-def _distrust(p, x0, y0, count, w, H):  # type: ignore[no-untyped-def]
-    """First weights: little where, away from the outline, a level is far from the start's; True if any is.
+def _distrust(p, x0, y0, count, wary, w, H):  # type: ignore[no-untyped-def]
+    """First weights: little where a level is far from the start's, at the outline from all between; True if any is.
 
     Otherwise a highlight beside the dot could pass for its blurred edge. Fills H as `normal_equations` does.
     """
-    scale = np.float32(STRANGE * abs(p[8]))
     strange = np.float32(0.0)
     w[WEIGHT : WEIGHT + count] = np.float32(1.0)
     H[:] = 0.0
     for first in range(0, count, CHUNK):
         some = filled_up(min(CHUNK, count - first))
         linearise(p, 1, x0, y0, first, some, w)
-        strange += _weigh_levels(first, min(CHUNK, count - first), scale, w)
+        strange += _weigh_levels(first, min(CHUNK, count - first), p[8], w)
         add_products(first, some, w, H)
-    if strange < 4:
+    if not wary or strange < max(4.0, FEW * count):
         return False
-    w[WEIGHT : WEIGHT + count] = w[SIZE : SIZE + count]
+    _widen(BESIDE * np.sqrt(0.5 * (p[5] + p[7])), count, w)
+    w[WEIGHT : WEIGHT + count] = w[SHOWN : SHOWN + count]
     normal_equations(p, 1, x0, y0, count, w, H)
     return True
 
 
 @njit(**FAST)
-def _weigh_levels(first, count, scale, w):  # type: ignore[no-untyped-def]
-    """Fills a linearised chunk's weights, 1 at the outline; returns how many are small."""
+def _weigh_levels(first, count, contrast, w):  # type: ignore[no-untyped-def]
+    """Fills a linearised chunk's weights by the levels shown; returns how many are small."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
-    one = np.float32(1.0)
-    strange = np.float32(0.0)
+    zero, one = np.float32(0.0), np.float32(1.0)
+    scale = np.float32(1.0 / (STRANGE * abs(contrast)))
+    over = np.float32(1.0 / (STRANGE * contrast))
+    strange = zero
     for k in range(count):
-        z = w[J + 12 * CHUNK + k] / scale
-        far = abs(w[J + 8 * CHUNK + k] - np.float32(0.5)) > np.float32(0.4999)
-        weight = one / (one + z * z * z * z) if far else one
-        w[SIZE + first + k] = weight
-        strange += one if weight < np.float32(0.3) else np.float32(0.0)
+        step = w[J + 8 * CHUNK + k]
+        away = w[J + 12 * CHUNK + k]
+        beyond = away * over - (one - step) * np.float32(1.0 / STRANGE)  # the disc's level
+        short = -away * over - step * np.float32(1.0 / STRANGE)  # its surroundings'
+        far = abs(step - np.float32(0.5)) > np.float32(0.4999)
+        z = away * scale if far else max(max(beyond, short), zero)
+        weight = one / (one + z * z * z * z)
+        w[SHOWN + first + k] = weight
+        strange += one if weight < np.float32(LITTLE) else zero
     return strange
 
 

@@ -40,6 +40,7 @@ def cases() -> Iterator[Case]:
     yield Case("defocus 2.5 px", replace(plain, blur=2.5), 8.0, hard=True)
     yield Case("ellipses 0.7", plain, 8.0, ratio=0.7, hard=True)
     yield Case("glare", replace(plain, glare=0.5), 8.0, hard=True)
+    yield Case("glare on grey skin", replace(plain, skin=100.0, glare=0.5), 8.0, hard=True)
     box = (90.0, 80.0, 1190.0, 640.0)
     yield Case("beam's edge", replace(plain, skin_box=box), 8.0, hard=True)
     yield Case("clutter", replace(plain, skin_box=box, clutter=30.0), 8.0, hard=True)

@@ -4,6 +4,7 @@ from support import picture
 
 from tracking.artificial import Scene, draw, expose
 from tracking.dots import Dots, find_dots, find_spots
+from tracking.family import find_family
 
 
 def nearest(dots: Dots, truth: tuple[float, float]) -> int:
@@ -50,16 +51,22 @@ def test_noise_errors_reach_the_bound_and_sigma_says_so() -> None:
     assert np.median(sigmas) == pytest.approx(rms, rel=0.3)
 
 
-def test_sigma_knows_of_highlights() -> None:
-    """Each dot with a highlight over its edge: what of it is not left out pulls the centre, and sigma tells."""
+@pytest.mark.parametrize(("skin", "dot"), [(175.0, 45.0), (100.0, 40.0), (40.0, 130.0)])
+def test_sigma_knows_of_highlights(skin: float, dot: float) -> None:
+    """Each dot with a highlight over its edge, up to two and a half times as far from its surroundings as the dot.
+
+    What of it is not left out pulls the centre, and sigma tells.
+    """
     scores = []
     for seed in range(3):
         random = np.random.default_rng(seed)
         x, y = np.meshgrid(np.arange(60.0, 740.0, 48.0), np.arange(60.0, 540.0, 48.0))
         centre = np.stack([x.ravel(), y.ravel()], axis=1) + random.uniform(-3, 3, (x.size, 2))
         ellipses = np.column_stack([centre, np.tile([8.0, 8.0, 0.0], (len(centre), 1))])
-        scene = Scene((800, 600), noise=4.0, slope=0.25, glare=1.0, fine=4)
-        dots = find_dots(expose(draw(scene, ellipses, random), scene, random), True)
+        scene = Scene((800, 600), skin, dot, noise=3.0, slope=0.25, glare=1.0, fine=4)
+        found = find_family(expose(draw(scene, ellipses, random), scene, random))
+        assert found is not None
+        dots = found[1]
         assert len(dots) == len(centre)
         for place in centre:
             k = nearest(dots, (place[0], place[1]))
