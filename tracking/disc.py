@@ -22,9 +22,9 @@ CHUNK = 256  # pixels whose derivatives are held at a time, so that they stay in
 LANES = 32  # pixels that vector instructions take at a time; a fit's last ones are filled up by some of no weight
 
 # Rows of a fit's scratch, one array: so the compiler sees that no two of them overlap.
-X, Y, VALUE, WEIGHT, RESIDUAL, SIZE, SHOWN = (LARGEST * row for row in range(7))
+X, Y, VALUE, WEIGHT, RESIDUAL, SIZE, SHOWN, FLAT = (LARGEST * row for row in range(8))
 BLOCK_OF = SIZE  # at another time
-J = 7 * LARGEST  # a chunk's derivatives by the parameters, 12 rows, and its residual
+J = 8 * LARGEST  # a chunk's derivatives by the parameters, 12 rows, and its residual
 WEIGHTED = J + 13 * CHUNK  # two rows
 SCRATCH = WEIGHTED + 2 * CHUNK
 LEAST_BLUR, MOST_BLUR = 0.08, 40.0  # of W along any direction [px^2]

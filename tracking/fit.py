@@ -6,6 +6,7 @@ from numba import njit
 from tracking.disc import (
     CHUNK,
     FAST,
+    FLAT,
     LARGEST,
     PARAMETERS,
     RESIDUAL,
@@ -36,25 +37,37 @@ LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edg
 def _reweight(p, instants, x0, y0, count, strange, w):  # type: ignore[no-untyped-def]
     """Less weight to pixels far off, by the median of the residuals' size; returns the largest change.
 
-    None at all to those that show something strange, and beside them.
+    At the outline by the median there: a dot drawn by hand is nowhere quite a disc. None at all to pixels that show
+    something strange, and beside them.
     """
     count = min(count, LARGEST)
-    for k in range(count):
-        w[SIZE + k] = abs(w[RESIDUAL + k])
-    scale = np.float32(1.4826) * np.median(w[SIZE : SIZE + count]) + np.float32(0.3)
-    w[SHOWN : SHOWN + count] = np.float32(1.0)
+    for first in range(0, count, CHUNK):
+        linearise(p, instants, x0, y0, first, filled_up(min(CHUNK, count - first)), w)
+        _weigh_levels(first, min(CHUNK, count - first), p[8], w)
     if strange:
-        for first in range(0, count, CHUNK):
-            linearise(p, instants, x0, y0, first, filled_up(min(CHUNK, count - first)), w)
-            _weigh_levels(first, min(CHUNK, count - first), p[8], w)
         _widen(BESIDE * np.sqrt(0.5 * (p[5] + p[5 if instants > 1 else 7])), count, w)
+    else:
+        w[SHOWN : SHOWN + count] = np.float32(1.0)
+    scale = _usual_size(1, count, w)
+    outline = max(_usual_size(0, count, w), scale)
     change = np.float32(0.0)
     for k in range(count):
-        z = w[RESIDUAL + k] / (np.float32(4.0) * scale)
+        z = w[RESIDUAL + k] / (np.float32(4.0) * (scale if w[FLAT + k] > np.float32(0.0) else outline))
         new = w[SHOWN + k] / (np.float32(1.0) + z * z * z * z)
         change = max(change, abs(new - w[WEIGHT + k]))
         w[WEIGHT + k] = new
     return change
+
+
+@njit(**FAST)
+def _usual_size(most, count, w):  # type: ignore[no-untyped-def]
+    """A standard deviation by the median of the residuals at the outline, where `most` is 0, or at all pixels (1)."""
+    count = min(count, LARGEST)
+    found = 0
+    for k in range(count):
+        w[SIZE + found] = abs(w[RESIDUAL + k])
+        found += int((w[FLAT + k] <= most) & (w[SHOWN + k] > np.float32(0.0)))
+    return np.float32(1.4826) * np.median(w[SIZE : SIZE + max(found, 1)]) + np.float32(0.3)
 
 
 @njit(**FAST)
@@ -162,7 +175,7 @@ def _distrust(p, x0, y0, count, wary, w, H):  # type: ignore[no-untyped-def]
 
 @njit(**FAST)
 def _weigh_levels(first, count, contrast, w):  # type: ignore[no-untyped-def]
-    """Fills a linearised chunk's weights by the levels shown; returns how many are small."""
+    """Fills a linearised chunk's weights by the levels shown, and which are flat; returns how many are small."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -178,6 +191,7 @@ def _weigh_levels(first, count, contrast, w):  # type: ignore[no-untyped-def]
         z = away * scale if far else max(max(beyond, short), zero)
         weight = one / (one + z * z * z * z)
         w[SHOWN + first + k] = weight
+        w[FLAT + first + k] = one if far else zero
         strange += one if weight < np.float32(LITTLE) else zero
     return strange
 
