@@ -30,8 +30,9 @@ logging.getLogger("libav").propagate = False
 # What makes FFmpeg's decoders report damage instead of painting over it, and how coarsely a picture was coded.
 STRICT = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data": "venc_params"}
 H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
-# Frames of which one is asked how it was coded: kinds of frames come in fours and twelves.
-ASKED = 7
+# Frames of which one is asked how it was coded, and fewer once so many have passed; kinds of frames come in fours and
+# twelves. Each answer takes as long as a third of a frame.
+ASKED, LATER, MANY = 7, 29, 140
 STEPS = 0.625 * 2.0 ** (np.arange(-64, 128) / 6.0)  # by quantiser, from -64
 # What x264 says of itself in its first packet, and how much coarser its pictures are than their steps alone would make
 # them where it searched no more thoroughly than that (its `subme`). Measured on seven presets at crf 23: in a hurry it
@@ -97,7 +98,7 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
                 coarser = _coarser(bytes(packet))
             taken = []
             while frames:
-                asked = tells and number % ASKED == 0
+                asked = tells and number % (ASKED if number < MANY else LATER) == 0
                 # A decoder that needs no earlier pictures works the quicker the sooner it has its memory back.
                 taken.append(_taken(frames.pop(0), codec.intra_only or asked, coarser if asked else None))
                 number += 1
