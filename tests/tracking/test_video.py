@@ -1,5 +1,6 @@
 import struct
 import threading
+from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 from support import FRAMES, ramp, write_video
 
 from groundwork import InputError
-from tracking.decoding import _pieces, frames_of_file
+from tracking.decoding import Decoder, _all_decoded, frames_of_file
 from tracking.order import Decoded, Order, Piece
 from tracking.video import open_video
 
@@ -186,21 +187,20 @@ def test_small_pictures_have_one_decoder_and_large_ones_several(
 ) -> None:
     """As many as keep pace with the follower, and no more than four."""
     monkeypatch.setattr("os.cpu_count", lambda: 8)
+    many: list[int] = []
+
+    def counted(packets: Iterator[av.Packet], decoders: list[Decoder]) -> Iterator[object]:
+        many.append(len(decoders))
+        return _all_decoded(packets, decoders)
+
+    monkeypatch.setattr("tracking.decoding._all_decoded", counted)
     random = np.random.default_rng(4)
-    many = {}
     for side in (64, 800):
         pictures = [random.integers(0, 256, (side, side)).astype(np.uint8)] * 6
-        write_video(tmp_path / f"{side}.avi", "mjpeg", "yuvj420p", pictures=pictures)
-        used: set[int] = set()
-
-        def decoded(packet: av.Packet, decoder: av.CodecContext, used: set[int] = used) -> object:
-            used.add(id(decoder))
-            return [], False
-
-        monkeypatch.setattr("tracking.decoding._decoded", decoded)
-        assert len(list(frames_of_file(tmp_path / f"{side}.avi", 0, 0.0, []))) == 6
-        many[side] = len(used)
-    assert many == {64: 1, 800: 4}
+        for name, codec, pixels in (("a.avi", "mjpeg", "yuvj420p"), ("a.mov", "prores_ks", "yuv422p10le")):
+            write_video(tmp_path / name, codec, pixels, pictures=pictures)
+            assert len(list(open_video(tmp_path / name).read())) == 6
+    assert many == [1, 1, 4, 4]
 
 
 def test_reading_can_stop_while_decoders_are_at_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,23 +212,6 @@ def test_reading_can_stop_while_decoders_are_at_work(tmp_path: Path, monkeypatch
     next(reading)
     reading.close()  # type: ignore[attr-defined]
     assert threading.active_count() == running
-
-
-def test_the_log_is_on_wherever_it_is_needed(tmp_path: Path) -> None:
-    """Off for MJPEG alone; a video read beside it whose decoder must be heard turns it on."""
-    write_video(tmp_path / "a.avi", "mjpeg", "yuvj420p")
-    write_video(tmp_path / "b.mkv", "ffv1", "gray")
-    quiet = _pieces(tmp_path / "a.avi", [])
-    next(quiet)
-    assert av.logging.get_level() is None
-    loud = _pieces(tmp_path / "b.mkv", [])
-    next(loud)
-    other = _pieces(tmp_path / "a.avi", [])
-    next(other)
-    assert av.logging.get_level() == av.logging.ERROR
-    for reading in (quiet, loud, other):
-        assert sum(len(piece.frames) for piece in reading) == FRAMES - 1
-        assert av.logging.get_level() == av.logging.ERROR
 
 
 def test_a_stamp_far_ahead_does_not_keep_the_others_waiting() -> None:
@@ -296,10 +279,11 @@ def lay_on_its_side(path: Path) -> None:
     path.write_bytes(content)
 
 
-def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "codec", "pixels"), [("a.mp4", "libx264", "yuv420p"), ("a.mov", "mjpeg", "yuvj420p")])
+def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path, name: str, codec: str, pixels: str) -> None:
     """As telephones write it: the pictures lie on their side, the file's display matrix says a quarter turn."""
-    path = tmp_path / "a.mp4"
-    write_video(path, "libx264", "yuv420p", options={"crf": "4"})
+    path = tmp_path / name
+    write_video(path, codec, pixels, options=QUIET.get(codec))
     lay_on_its_side(path)
     video = open_video(path)
     assert video.size == (64, 96)

@@ -1,0 +1,119 @@
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import cv2
+import numpy as np
+from support import write_video
+
+from tracking.ffmpeg import FFmpegDecoder
+from tracking.jpeg import JpegDecoder
+from tracking.video import open_video
+
+COUNT = 12
+
+
+def film(path: Path, **options: str) -> list[bytes]:
+    """Blurred noise as Motion JPEG; its packets."""
+    random = np.random.default_rng(7)
+    pictures = [
+        cv2.GaussianBlur(random.uniform(0, 255, (144, 192)).astype(np.float32), (0, 0), 2.0) for _ in range(COUNT)
+    ]
+    write_video(
+        path,
+        "mjpeg",
+        "yuvj420p",
+        options=options,
+        pictures=[(3.0 * p - 255.0).clip(0, 255).astype(np.uint8) for p in pictures],
+    )
+    with av.open(str(path)) as container:
+        return [bytes(packet) for packet in container.demux(video=0) if packet.size]
+
+
+def change(path: Path, changed: Callable[[int, bytes], bytes]) -> None:
+    """Write a video's packets again, changed by their number and content."""
+    with av.open(str(path)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream("mjpeg", rate=100)
+        stream.height, stream.width, stream.pix_fmt = 144, 192, "yuvj420p"
+        for number, content in enumerate(packets):
+            packet = av.Packet(changed(number, content))
+            packet.stream, packet.pts, packet.dts, packet.is_keyframe = stream, number, number, True
+            output.mux(packet)
+
+
+def test_luma_is_what_ffmpeg_decodes(tmp_path: Path) -> None:
+    path = tmp_path / "a.avi"
+    film(path, qmin="2", qmax="2")
+    with av.open(str(path)) as container:
+        stream = container.streams.video[0]
+        ffmpeg, decoder = FFmpegDecoder(stream), JpegDecoder.of(path)
+        assert decoder is not None
+        for packet in container.demux(stream):
+            (ours, damaged), (theirs, _) = decoder.decode(packet), ffmpeg.decode(packet)
+            assert not damaged
+            assert [frame.stamp for frame in ours] == [frame.stamp for frame in theirs]
+            for one, other in zip(ours, theirs, strict=True):
+                assert one.picture is not None
+                assert np.abs(one.picture - other.picture.astype(float)).max() <= 3
+
+
+def test_overwritten_code_is_told(tmp_path: Path) -> None:
+    """Of a picture's code up to 400 bytes are overwritten or zeroed: 4 % may pass, of FFmpeg more than twice as much."""
+    path = tmp_path / "a.avi"
+    packets = film(path)
+    decoder = JpegDecoder.of(path)
+    assert decoder is not None
+    random = np.random.default_rng(8)
+    wrong = {"ours": 0, "ffmpeg": 0}
+    with av.open(str(path)) as container:
+        ffmpeg = FFmpegDecoder(container.streams.video[0])
+        for trial in range(300):
+            content = packets[trial % COUNT]
+            head = content.index(b"\xff\xda") + 14
+            start = int(random.integers(head, len(content) - 2))
+            length = min(int(random.integers(1, 400)), len(content) - 2 - start)
+            other = random.bytes(length) if trial % 2 else bytes(length)
+            damaged = content[:start] + other + content[start + length :]
+            for name, decode in (("ours", decoder.decode), ("ffmpeg", ffmpeg.decode)):
+                (truth,), _ = decode(av.Packet(content))
+                for frame in decode(av.Packet(damaged))[0]:
+                    if frame.picture is not None:
+                        wrong[name] += np.abs(frame.picture - truth.picture.astype(float)).max() > 8
+    assert wrong["ours"] <= 12
+    assert wrong["ffmpeg"] > 2 * wrong["ours"]
+
+
+def test_bytes_that_a_camera_leaves_about_are_no_damage(tmp_path: Path) -> None:
+    """As some webcams do before the picture's end, where damage leaves them as well: FFmpeg reads these."""
+    path = tmp_path / "a.avi"
+    film(path)
+    whole = [frame.picture for frame in open_video(path).read()]
+    change(path, lambda number, content: content[:-2] + bytes(6 + number % 3) + content[-2:])
+    assert JpegDecoder.of(path) is None
+    for frame, picture in zip(open_video(path).read(), whole, strict=True):
+        assert frame.picture is not None
+        assert picture is not None
+        assert np.abs(frame.picture - picture.astype(float)).max() <= 3
+
+
+def test_one_damaged_picture_at_the_start_is_missing_and_the_others_right(tmp_path: Path) -> None:
+    path = tmp_path / "a.avi"
+    film(path)
+    whole = [frame.picture for frame in open_video(path).read()]
+    change(path, lambda number, content: content[: len(content) // 2] if number == 0 else content)
+    found = [frame.picture for frame in open_video(path).read()]
+    assert found[0] is None
+    for picture, before in zip(found[1:], whole[1:], strict=True):
+        np.testing.assert_array_equal(picture, before)
+
+
+def test_a_header_that_claims_another_size_is_damage(tmp_path: Path) -> None:
+    path = tmp_path / "a.avi"
+    packets = film(path)
+    decoder = JpegDecoder.of(path)
+    assert decoder is not None
+    at = packets[0].index(b"\xff\xc0") + 5
+    for claimed in (b"\xff\xff\xff\xff", b"\x00\x10\x00\x10"):
+        assert decoder.decode(av.Packet(packets[0][:at] + claimed + packets[0][at + 4 :])) == ([], True)
