@@ -60,7 +60,7 @@ def test_luma_is_what_ffmpeg_decodes(tmp_path: Path) -> None:
 
 
 def test_overwritten_code_is_told(tmp_path: Path) -> None:
-    """Of a picture's code up to 400 bytes are overwritten or zeroed: 4 % may pass, of FFmpeg more than twice as much."""
+    """Up to 400 bytes are overwritten or zeroed: 4 % may pass, by FFmpeg more than twice as much."""
     path = tmp_path / "a.avi"
     packets = film(path)
     decoder = JpegDecoder.of(path)
