@@ -4,6 +4,7 @@ import gc
 import logging
 import re
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import av
 import numpy as np
@@ -21,6 +22,11 @@ logging.getLogger("libav").addHandler(logging.NullHandler())
 logging.getLogger("libav").propagate = False
 # What makes FFmpeg's decoders report damage instead of painting over it, and how coarsely a picture was coded.
 STRICT = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data": "venc_params"}
+# What H.264 and HEVC never write within a unit, and zeros that overwrite one look like; HEVC's decoder reads on in
+# silence. By codec, which bits of a unit's first byte are its kind, the kinds that hold pictures, and where the file's
+# header tells how many bytes come before each unit for its length.
+FORBIDDEN = re.compile(rb"\0\0[\0-\2]")
+UNITS = {"h264": (0x1F, range(1, 6), 4), "hevc": (0x7E, range(64), 21)}
 H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
 # Frames of which one is asked how it was coded, and fewer once so many have passed; kinds of frames come in fours and
 # twelves. Each answer takes as long as a third of a frame.
@@ -43,6 +49,7 @@ class FFmpegDecoder:
         self.context.options = STRICT
         self.copies = self.context.codec.intra_only
         self.tells = self.context.codec.name == "h264"
+        self.units = _Units.of(self.context)
         self.number = 0
         self.coarser = 0.0  # not known yet
 
@@ -59,7 +66,7 @@ class FFmpegDecoder:
             self.number += 1
             if asked:
                 gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
-        return taken, complained
+        return taken, complained or (self.units is not None and self.units.overwritten(bytes(packet)))
 
     def decoded(self, packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
         """FFmpeg's frames, and whether it complained."""
@@ -70,6 +77,39 @@ class FFmpegDecoder:
                 return [], True
         complaints = any(level <= av.logging.ERROR for level, _, _ in messages)
         return frames, complaints or packet.is_corrupt
+
+
+@dataclass(frozen=True)
+class _Units:
+    """How H.264 or HEVC lies in a file whose packets hold units, each after its length.
+
+    Attributes:
+        kind: bits of a unit's first byte that tell its kind.
+        pictures: kinds that hold parts of pictures.
+        prefix: bytes of the length.
+    """
+
+    kind: int
+    pictures: range
+    prefix: int
+
+    @classmethod
+    def of(cls, context: "av.CodecContext") -> "_Units | None":
+        """None for other codecs, and where units follow each other without lengths."""
+        header = context.extradata or b""
+        kind, pictures, place = UNITS.get(context.codec.name, (0, range(0), len(header)))
+        return cls(kind, pictures, (header[place] & 3) + 1) if len(header) > place and header[0] == 1 else None
+
+    def overwritten(self, packet: bytes) -> bool:
+        """Whether a part of a picture holds what its encoder cannot have written."""
+        start = 0
+        while start + self.prefix < len(packet):
+            end = start + self.prefix + int.from_bytes(packet[start : start + self.prefix], "big")
+            unit = packet[start + self.prefix : end]
+            if unit and unit[0] & self.kind in self.pictures and FORBIDDEN.search(unit.rstrip(b"\0")):
+                return True
+            start = end
+        return False
 
 
 def packets_of(

@@ -123,6 +123,32 @@ def test_damaged_frames_are_missing_and_the_others_right(
             np.testing.assert_array_equal(frame.picture, picture)
 
 
+@pytest.mark.parametrize("codec", ["libx264", "libx265"])
+@pytest.mark.parametrize("name", ["a.mp4", "a.mkv"])
+def test_zeros_within_a_picture_are_damage(tmp_path: Path, name: str, codec: str) -> None:
+    """As a disk's lost sectors leave them; HEVC's decoder takes them for pictures. Whole files are not suspected."""
+    path = tmp_path / name
+    random = np.random.default_rng(5)
+    pictures = [random.integers(0, 256, (96, 128)).astype(np.uint8) for _ in range(10)]
+    write_video(path, codec, "yuv420p", options=QUIET[codec] | {"g": "5"}, pictures=pictures)
+    truth = [frame.picture for frame in open_video(path).read()]
+    assert all(picture is not None for picture in truth)
+    with av.open(str(path)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    content = path.read_bytes()
+    for number in range(2, 10):
+        damaged = bytearray(content)
+        length = int(random.integers(16, 400))
+        start = content.find(packets[number]) + int(random.integers(20, len(packets[number]) - length - 1))
+        damaged[start : start + length] = bytes(length)
+        path.write_bytes(damaged)
+        frames = list(open_video(path).read())
+        assert any(frame.picture is None for frame in frames)
+        for frame, picture in zip(frames, truth, strict=True):
+            if frame.picture is not None:
+                np.testing.assert_array_equal(frame.picture, picture)
+
+
 def test_frames_that_refer_to_a_damaged_one_are_missing_though_shown_before_it(tmp_path: Path) -> None:
     """H.264 with B-frames, a packet's beginning overwritten: the decoder owns up when its frame is out."""
     path = tmp_path / "a.mp4"
