@@ -25,7 +25,7 @@ STRICT = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data":
 # What H.264 and HEVC never write within a unit, and zeros that overwrite one look like; HEVC's decoder reads on in
 # silence. By codec, which bits of a unit's first byte are its kind, the kinds that hold pictures, and where the file's
 # header tells how many bytes come before each unit for its length.
-FORBIDDEN = re.compile(rb"\0\0[\0-\2]")
+FORBIDDEN, PADDING = re.compile(rb"\0\0[\0-\2]"), b"\0\0\0"
 UNITS = {"h264": (0x1F, range(1, 6), 4), "hevc": (0x7E, range(64), 21)}
 H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
 # Frames of which one is asked how it was coded, and fewer once so many have passed; kinds of frames come in fours and
@@ -50,6 +50,7 @@ class FFmpegDecoder:
         self.copies = self.context.codec.intra_only
         self.tells = self.context.codec.name == "h264"
         self.units = _Units.of(self.context)
+        self.padded: bool | None = None  # whether zeros follow the units, as some programs write them; not known yet
         self.number = 0
         self.coarser = 0.0  # not known yet
 
@@ -66,7 +67,17 @@ class FFmpegDecoder:
             self.number += 1
             if asked:
                 gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
-        return taken, complained or (self.units is not None and self.units.overwritten(bytes(packet)))
+        return taken, complained or self._overwritten(bytes(packet))
+
+    def _overwritten(self, packet: bytes) -> bool:
+        """Whether a picture holds what H.264 and HEVC never write."""
+        if self.units is None or not packet:
+            return False
+        self.padded = packet.endswith(PADDING) if self.padded is None else self.padded
+        return any(
+            FORBIDDEN.search(unit.rstrip(b"\0")) or (unit.endswith(PADDING) and not self.padded)
+            for unit in self.units.pictures_in(packet)
+        )
 
     def decoded(self, packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
         """FFmpeg's frames, and whether it complained."""
@@ -100,16 +111,15 @@ class _Units:
         kind, pictures, place = UNITS.get(context.codec.name, (0, range(0), len(header)))
         return cls(kind, pictures, (header[place] & 3) + 1) if len(header) > place and header[0] == 1 else None
 
-    def overwritten(self, packet: bytes) -> bool:
-        """Whether a part of a picture holds what its encoder cannot have written."""
+    def pictures_in(self, packet: bytes) -> Iterator[bytes]:
+        """The units that hold parts of pictures."""
         start = 0
         while start + self.prefix < len(packet):
             end = start + self.prefix + int.from_bytes(packet[start : start + self.prefix], "big")
             unit = packet[start + self.prefix : end]
-            if unit and unit[0] & self.kind in self.pictures and FORBIDDEN.search(unit.rstrip(b"\0")):
-                return True
+            if unit and unit[0] & self.kind in self.pictures:
+                yield unit
             start = end
-        return False
 
 
 def packets_of(

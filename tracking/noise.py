@@ -25,6 +25,7 @@ MODES = 12  # of the body's motion, at most
 SPARE = 8  # further ones, of which those of the other markers may need a little
 VANISHED = 1e-6  # share of a mode's square that others than one marker have: it is that marker's alone
 TELLING = 0.3  # of a fit's variance: an excess smaller than this may be chance
+OUTLYING = 6.0  # medians of a marker's distances from where the others put it: farther ones are few
 SURPRISING = 3.0  # standard deviations: farther from where the others put it, a marker moves on its own
 
 
@@ -147,14 +148,22 @@ def _without_one(square: Array, modes: Array, product: Array) -> tuple[Array, Ar
 
 
 def with_shared_errors(sigma: Array, others: Others) -> Array:
-    """Standard deviations (T, D, 2) that also hold what a marker's path has beyond the errors `sigma` so far [px]."""
-    own = (sigma[np.ix_(others.frames, others.markers)] ** 2).mean(axis=0)
-    beyond = others.missed / (1.0 + others.carried) - own
+    """Standard deviations (T, D, 2) that also hold what a marker's path has beyond the errors `sigma` so far [px].
+
+    A few places that are far off tell of themselves only.
+    """
+    where = np.ix_(others.frames, others.markers)
+    own = (sigma[where] ** 2).mean(axis=0)
+    square = others.away**2 * (1.0 - others.leverage[..., None])
+    near = np.minimum(square, OUTLYING**2 * np.median(square, axis=0))
+    beyond = near.mean(axis=0) / (1.0 + others.carried) - own
     excess = np.where(beyond > TELLING * own, beyond, 0.0)
     added = np.zeros((sigma.shape[1], 2))
     added[:] = np.median(excess, axis=0)
     added[others.markers] = excess
-    return np.sqrt(sigma**2 + added)
+    whole = np.sqrt(sigma**2 + added)
+    whole[where] = np.maximum(whole[where], np.sqrt(square) / SURPRISING)
+    return whole
 
 
 def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tuple[Array, Array]:

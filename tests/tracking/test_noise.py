@@ -92,6 +92,20 @@ def test_places_stay_where_nothing_is_known_of_the_coding(random: np.random.Gene
     np.testing.assert_array_equal(place, pixel)
 
 
+def test_a_place_far_off_says_so_and_no_other_does(random: np.random.Generator) -> None:
+    """As a picture whose damage went unnoticed puts it, 16 px away for one frame; nothing is known of the coding."""
+    pixel = paths(random, np.full(20, 0.05))
+    pixel[77, 8, 1] += 16.0
+    sigma = np.full(pixel.shape, 0.05)
+    unknown = np.full(pixel.shape, np.nan)
+    place, found = places_and_errors(pixel, sigma, unknown, unknown[..., 0])
+    np.testing.assert_array_equal(place, pixel)
+    assert found[77, 8, 1] > 4.0
+    found[77, 8, 1] = np.nan
+    assert np.nanmax(found) < 0.2
+    assert np.nanmean(found) == pytest.approx(0.05, rel=0.1)
+
+
 def test_frames_in_which_some_are_hidden_keep_their_places(random: np.random.Generator) -> None:
     pixel = paths(random, np.full(20, 0.05))
     pixel[50:60, 4] = np.nan
