@@ -30,7 +30,7 @@ UNITS = {"h264": (0x1F, range(1, 6), 4), "hevc": (0x7E, range(64), 21)}
 H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
 # Frames of which one is asked how it was coded, and fewer once so many have passed; kinds of frames come in fours and
 # twelves. Each answer takes as long as a third of a frame.
-ASKED, LATER, MANY = 7, 29, 140
+ASKED, LATER, MANY = 7, 59, 70
 STEPS = 0.625 * 2.0 ** (np.arange(-64, 128) / 6.0)  # by quantiser, from -64
 # What x264 says of itself in its first packet, and how much coarser its pictures are than their steps alone would make
 # them where it searched no more thoroughly than that (its `subme`). Measured on seven presets at crf 23: in a hurry it
