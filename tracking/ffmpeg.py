@@ -4,7 +4,6 @@ import gc
 import logging
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import av
 import numpy as np
@@ -22,11 +21,9 @@ logging.getLogger("libav").addHandler(logging.NullHandler())
 logging.getLogger("libav").propagate = False
 # What makes FFmpeg's decoders report damage instead of painting over it, and how coarsely a picture was coded.
 STRICT = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data": "venc_params"}
-# What H.264 and HEVC never write within a unit, and zeros that overwrite one look like; HEVC's decoder reads on in
-# silence. By codec, which bits of a unit's first byte are its kind, the kinds that hold pictures, and where the file's
-# header tells how many bytes come before each unit for its length.
-FORBIDDEN, PADDING = re.compile(rb"\0\0[\0-\2]"), b"\0\0\0"
-UNITS = {"h264": (0x1F, range(1, 6), 4), "hevc": (0x7E, range(64), 21)}
+# What H.264 and HEVC never write where a file tells how long their units are, and what lost sectors look like; their
+# decoders may read on in silence.
+NEVER, WRITERS = bytes(4), {"h264", "hevc"}
 H264_PARAMETERS = 1  # FFmpeg's number for the kind of parameters that H.264 has
 # Frames of which one is asked how it was coded, and fewer once so many have passed; kinds of frames come in fours and
 # twelves. Each answer takes as long as a third of a frame.
@@ -49,8 +46,8 @@ class FFmpegDecoder:
         self.context.options = STRICT
         self.copies = self.context.codec.intra_only
         self.tells = self.context.codec.name == "h264"
-        self.units = _Units.of(self.context)
-        self.padded: bool | None = None  # whether zeros follow the units, as some programs write them; not known yet
+        self.watched = self.context.codec.name in WRITERS and (self.context.extradata or b"").startswith(b"\1")
+        self.begun = False
         self.number = 0
         self.coarser = 0.0  # not known yet
 
@@ -59,6 +56,12 @@ class FFmpegDecoder:
         frames, complained = self.decoded(packet)
         if self.tells and not self.coarser:
             self.coarser = _coarser(bytes(packet))
+        if self.watched:
+            content = bytes(packet)
+            # Some programs write zeros after every picture.
+            self.watched = self.begun or not content.endswith(NEVER)
+            complained |= self.watched and NEVER in content
+        self.begun = True
         taken = []
         while frames:
             asked = self.tells and self.number % (ASKED if self.number < MANY else LATER) == 0
@@ -67,17 +70,7 @@ class FFmpegDecoder:
             self.number += 1
             if asked:
                 gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
-        return taken, complained or self._overwritten(bytes(packet))
-
-    def _overwritten(self, packet: bytes) -> bool:
-        """Whether a picture holds what H.264 and HEVC never write."""
-        if self.units is None or not packet:
-            return False
-        self.padded = packet.endswith(PADDING) if self.padded is None else self.padded
-        return any(
-            FORBIDDEN.search(unit.rstrip(b"\0")) or (unit.endswith(PADDING) and not self.padded)
-            for unit in self.units.pictures_in(packet)
-        )
+        return taken, complained
 
     def decoded(self, packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
         """FFmpeg's frames, and whether it complained."""
@@ -88,38 +81,6 @@ class FFmpegDecoder:
                 return [], True
         complaints = any(level <= av.logging.ERROR for level, _, _ in messages)
         return frames, complaints or packet.is_corrupt
-
-
-@dataclass(frozen=True)
-class _Units:
-    """How H.264 or HEVC lies in a file whose packets hold units, each after its length.
-
-    Attributes:
-        kind: bits of a unit's first byte that tell its kind.
-        pictures: kinds that hold parts of pictures.
-        prefix: bytes of the length.
-    """
-
-    kind: int
-    pictures: range
-    prefix: int
-
-    @classmethod
-    def of(cls, context: "av.CodecContext") -> "_Units | None":
-        """None for other codecs, and where units follow each other without lengths."""
-        header = context.extradata or b""
-        kind, pictures, place = UNITS.get(context.codec.name, (0, range(0), len(header)))
-        return cls(kind, pictures, (header[place] & 3) + 1) if len(header) > place and header[0] == 1 else None
-
-    def pictures_in(self, packet: bytes) -> Iterator[bytes]:
-        """The units that hold parts of pictures."""
-        start = 0
-        while start + self.prefix < len(packet):
-            end = start + self.prefix + int.from_bytes(packet[start : start + self.prefix], "big")
-            unit = packet[start + self.prefix : end]
-            if unit and unit[0] & self.kind in self.pictures:
-                yield unit
-            start = end
 
 
 def packets_of(
