@@ -3,9 +3,10 @@
 import os
 import queue
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
+from itertools import islice
 from pathlib import Path
 
 import av
@@ -19,8 +20,10 @@ from tracking.frame import Frame
 from tracking.jpeg import JpegDecoder
 from tracking.order import Decoded, Order, Piece
 
-Decoder = Callable[["av.packet.Packet"], tuple[list[Decoded], bool]]
+Outcome = tuple["av.packet.Packet", list[Decoded], bool]  # the frames that a packet completes, whether it is damaged
+Decoder = Callable[[list["av.packet.Packet"]], list[Outcome]]
 
+TOGETHER = 4  # packets
 # Decoders side by side, of videos each of whose pictures stands for itself: one more for so many bytes a picture, which
 # take about as long as following the dots in it. More than it needs would only keep the follower from its work.
 MOST_DECODERS, BYTES_EACH = 4, 40_000
@@ -84,33 +87,32 @@ def _decoders_worth(path: Path) -> int:
         return 1 + (0 if first is None else first.size // BYTES_EACH)
 
 
-def _all_decoded(
-    packets: Iterable["av.packet.Packet"], decoders: list[Decoder]
-) -> Iterator[tuple["av.packet.Packet", list[Decoded], bool]]:
-    """Packets in their order, each with its frames and whether it is damaged."""
+def _all_decoded(packets: Iterator["av.packet.Packet"], decoders: list[Decoder]) -> Iterator[Outcome]:
+    """What comes of packets, in their order."""
+    handfuls = iter(lambda: list(islice(packets, TOGETHER)), [])
     if len(decoders) == 1:
-        yield from ((packet, *decoders[0](packet)) for packet in packets)
+        for handful in handfuls:
+            yield from decoders[0](handful)
         return
     idle: queue.SimpleQueue[Decoder] = queue.SimpleQueue()
     for decoder in decoders:
         idle.put(decoder)
 
-    def work(packet: "av.packet.Packet") -> tuple[list[Decoded], bool]:
+    def work(handful: list["av.packet.Packet"]) -> list[Outcome]:
         decoder = idle.get()
         try:
-            return decoder(packet)
+            return decoder(handful)
         finally:
             idle.put(decoder)
 
-    begun: deque[tuple[av.packet.Packet, Future[tuple[list[Decoded], bool]]]] = deque()
+    begun: deque[Future[list[Outcome]]] = deque()
     with ThreadPoolExecutor(len(decoders)) as pool:
-        for packet in packets:
-            begun.append((packet, pool.submit(work, packet)))
+        for handful in handfuls:
+            begun.append(pool.submit(work, handful))
             if len(begun) > len(decoders):
-                packet, result = begun.popleft()
-                yield packet, *result.result()
-        for packet, result in begun:
-            yield packet, *result.result()
+                yield from begun.popleft().result()
+        for result in begun:
+            yield from result.result()
 
 
 def _contradictions(name: str, frames: int, fps: float, time: NDArray) -> list[str]:

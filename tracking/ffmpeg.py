@@ -51,9 +51,16 @@ class FFmpegDecoder:
         self.number = 0
         self.coarser = 0.0  # not known yet
 
-    def decode(self, packet: "av.packet.Packet") -> tuple[list[Decoded], bool]:
-        """The frames that a packet completes, and whether it is damaged."""
-        frames, complained = self.decoded(packet)
+    def decode(self, packets: list["av.packet.Packet"]) -> list[tuple["av.packet.Packet", list[Decoded], bool]]:
+        """The next packets, each with the frames that it completes, and whether it is damaged."""
+        # First all decoding, then all else: each time the one has driven the other's code out of the caches.
+        decoded = [(packet, *self.decoded(packet)) for packet in packets]
+        return [(each[0], *self._taken(*each)) for each in decoded]
+
+    def _taken(
+        self, packet: "av.packet.Packet", frames: list["av.VideoFrame"], complained: bool
+    ) -> tuple[list[Decoded], bool]:
+        """What is needed of a packet's frames, and whether it is damaged."""
         if self.tells and not self.coarser:
             self.coarser = _coarser(bytes(packet))
         if self.watched:

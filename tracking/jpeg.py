@@ -53,10 +53,14 @@ class JpegDecoder:
                     agreed.append(decoder)
         return agreed[0] if agreed and refused <= 1 else None
 
-    def decode(self, packet: "av.packet.Packet") -> tuple[list[Decoded], bool]:
-        """The frame in a packet, and whether it is damaged."""
-        picture = self.picture(packet) if packet.size and not packet.is_corrupt else None
-        return ([], packet.size > 0) if picture is None else ([Decoded(packet.pts, picture, None)], False)
+    def decode(self, packets: list["av.packet.Packet"]) -> list[tuple["av.packet.Packet", list[Decoded], bool]]:
+        """Packets, each with the frame in it, and whether it is damaged."""
+        outcomes = []
+        for packet in packets:
+            picture = self.picture(packet) if packet.size and not packet.is_corrupt else None
+            frames = [] if picture is None else [Decoded(packet.pts, picture, None)]
+            outcomes.append((packet, frames, packet.size > 0 and picture is None))
+        return outcomes
 
     def picture(self, packet: "av.packet.Packet") -> NDArray[np.uint8] | None:
         """Its luma plane, turned as it is to be shown; None where it is not as it should be."""

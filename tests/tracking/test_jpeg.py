@@ -51,7 +51,7 @@ def test_luma_is_what_ffmpeg_decodes(tmp_path: Path) -> None:
         ffmpeg, decoder = FFmpegDecoder(stream), JpegDecoder.of(path)
         assert decoder is not None
         for packet in container.demux(stream):
-            (ours, damaged), (theirs, _) = decoder.decode(packet), ffmpeg.decode(packet)
+            ((_, ours, damaged),), ((_, theirs, _),) = decoder.decode([packet]), ffmpeg.decode([packet])
             assert not damaged
             assert [frame.stamp for frame in ours] == [frame.stamp for frame in theirs]
             for one, other in zip(ours, theirs, strict=True):
@@ -77,8 +77,8 @@ def test_overwritten_code_is_told(tmp_path: Path) -> None:
             other = random.bytes(length) if trial % 2 else bytes(length)
             damaged = content[:start] + other + content[start + length :]
             for name, decode in (("ours", decoder.decode), ("ffmpeg", ffmpeg.decode)):
-                (truth,), _ = decode(av.Packet(content))
-                for frame in decode(av.Packet(damaged))[0]:
+                ((_, (truth,), _),) = decode([av.Packet(content)])
+                for frame in decode([av.Packet(damaged)])[0][1]:
                     if frame.picture is not None:
                         wrong[name] += np.abs(frame.picture - truth.picture.astype(float)).max() > 8
     assert wrong["ours"] <= 12
@@ -116,4 +116,5 @@ def test_a_header_that_claims_another_size_is_damage(tmp_path: Path) -> None:
     assert decoder is not None
     at = packets[0].index(b"\xff\xc0") + 5
     for claimed in (b"\xff\xff\xff\xff", b"\x00\x10\x00\x10"):
-        assert decoder.decode(av.Packet(packets[0][:at] + claimed + packets[0][at + 4 :])) == ([], True)
+        packet = av.Packet(packets[0][:at] + claimed + packets[0][at + 4 :])
+        assert decoder.decode([packet]) == [(packet, [], True)]
