@@ -1,4 +1,4 @@
-"""Packets of Motion JPEG turned into pictures by libjpeg-turbo, in half of FFmpeg's time.
+"""Packets of Motion JPEG turned into pictures by libjpeg-turbo, in half of FFmpeg's time, and files looked through.
 
 It also tells when a picture's code is longer than the picture. FFmpeg does not: a tenth of the packets in which bytes
 were overwritten come out of it as pictures that are wrong, a fiftieth here. One bit turned may read as valid to both.
@@ -18,6 +18,15 @@ from tracking.order import Decoded
 
 PROBED = 5  # first packets, of which one may be refused
 ROUNDED = 1.0  # grey levels by which two decoders of the same code may differ in the mean
+
+
+def is_whole(content: bytes) -> bool:
+    """Whether a JPEG file is read without complaint; in less than half the time that a picture of it takes."""
+    try:
+        simplejpeg.decode_jpeg(content, "GRAY", min_height=1, min_width=1, min_factor=8)
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)

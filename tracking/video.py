@@ -1,7 +1,7 @@
 """Grey pictures and their times out of video files and folders of images."""
 
 import re
-from collections.abc import Generator, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -15,9 +15,11 @@ from tracking.ahead import ahead
 from tracking.decoding import frames_of_file
 from tracking.ffmpeg import quarter_turns
 from tracking.frame import Frame, scaled
+from tracking.jpeg import PROBED, is_whole
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg", ".mpeg", ".ts"}
-PICTURE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+JPEG_SUFFIXES = {".jpg", ".jpeg"}
+PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".bmp"} | JPEG_SUFFIXES
 
 
 @dataclass
@@ -89,7 +91,7 @@ def open_video(path: Path) -> Video:
     """
     if path.is_dir():
         pictures = _pictures_in(path)
-        readable = (picture for picture in map(_read_picture, pictures) if picture is not None)
+        readable = (picture for picture in map(_reader_of(pictures), pictures) if picture is not None)
         first = next(readable, None)
         if first is None:
             raise InputError(f"expected pictures in {path}, none of which can be read; copy them again")
@@ -125,15 +127,31 @@ def _quarter_turns(container: "av.container.InputContainer", stream: "av.video.s
     return 0
 
 
+def _reader_of(pictures: list[Path]) -> Callable[[Path], NDArray | None]:
+    """Gives a file's picture; None where it cannot be read, or is a JPEG with damage that most of them do not have."""
+    begun = [path for path in pictures[:PROBED] if _read_picture(path) is not None]
+    odd = sum(not _is_sound(path) for path in begun)
+    return _read_picture if odd > 1 else lambda path: _read_picture(path) if _is_sound(path) else None
+
+
 def _read_picture(path: Path) -> NDArray | None:
     return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+
+
+def _is_sound(path: Path) -> bool:
+    try:
+        return path.suffix.lower() not in JPEG_SUFFIXES or is_whole(path.read_bytes())
+    except OSError:
+        return False
 
 
 def _folder_frames(folder: Path) -> Generator[Frame]:
     shape: tuple[int, ...] | None = None
     bits = 8
-    for path in _pictures_in(folder):
-        picture = _read_picture(path)
+    pictures = _pictures_in(folder)
+    read = _reader_of(pictures)
+    for path in pictures:
+        picture = read(path)
         if picture is None:
             yield Frame(np.nan, None)
             continue

@@ -4,6 +4,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import pytest
 from support import write_video
 
 from tracking.ffmpeg import FFmpegDecoder
@@ -107,6 +108,38 @@ def test_one_damaged_picture_at_the_start_is_missing_and_the_others_right(tmp_pa
     assert found[0] is None
     for picture, before in zip(found[1:], whole[1:], strict=True):
         np.testing.assert_array_equal(picture, before)
+
+
+@pytest.mark.parametrize("number", [0, 7])
+def test_a_damaged_file_in_a_folder_is_missing(tmp_path: Path, number: int) -> None:
+    """OpenCV makes a picture of it."""
+    folder = folder_of_files(tmp_path)
+    truth = [frame.picture for frame in open_video(folder).read()]
+    path = folder / f"{number}.jpg"
+    content = path.read_bytes()
+    path.write_bytes(content[: len(content) // 2] + bytes(60) + content[len(content) // 2 + 60 :])
+    assert cv2.imread(str(path)) is not None
+    found = [frame.picture for frame in open_video(folder).read()]
+    assert [k for k, picture in enumerate(found) if picture is None] == [number]
+    for k, picture in enumerate(found):
+        if picture is not None:
+            np.testing.assert_array_equal(picture, truth[k])
+
+
+def test_bytes_that_a_camera_leaves_in_every_file_are_no_damage(tmp_path: Path) -> None:
+    folder = folder_of_files(tmp_path)
+    for path in folder.iterdir():
+        content = path.read_bytes()
+        path.write_bytes(content[:-2] + bytes(6) + content[-2:])
+    assert all(frame.picture is not None for frame in open_video(folder).read())
+
+
+def folder_of_files(parent: Path) -> Path:
+    """The film as single files."""
+    (parent / "run").mkdir()
+    for number, content in enumerate(film(parent / "a.avi")):
+        (parent / "run" / f"{number}.jpg").write_bytes(content)
+    return parent / "run"
 
 
 def test_a_header_that_claims_another_size_is_damage(tmp_path: Path) -> None:
