@@ -190,7 +190,10 @@ def find_board(path: Path, name: str, board: BoardFile) -> tuple[View | None, tu
     Raises:
         InputError: the picture cannot be read.
     """
-    image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    try:
+        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # its header claims a picture too large for OpenCV
+        image = None
     if image is None:
         raise InputError(f"expected a picture of the board in {path}, which cannot be read; replace it")
     size = (image.shape[1], image.shape[0])

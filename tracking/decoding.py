@@ -15,12 +15,11 @@ from numpy.typing import NDArray
 
 from groundwork import InputError
 from tracking.ahead import ahead
-from tracking.ffmpeg import FFmpegDecoder, packets_of
+from tracking.ffmpeg import FFmpegDecoder, Outcome, packets_of
 from tracking.frame import Frame
 from tracking.jpeg import JpegDecoder
-from tracking.order import Decoded, Order, Piece
+from tracking.order import Order, Piece
 
-Outcome = tuple["av.packet.Packet", list[Decoded], bool]  # the frames that a packet completes, whether it is damaged
 Decoder = Callable[[list["av.packet.Packet"]], list[Outcome]]
 
 TOGETHER = 4  # packets

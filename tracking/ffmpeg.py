@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from tracking.frame import MACROBLOCK, scaled
 from tracking.order import Decoded
 
+Outcome = tuple["av.packet.Packet", list[Decoded], bool]  # the frames that a packet completes, whether it is damaged
+
 # Decoders tell of damage in their log, the same words again for the next packet; what nobody listens to is nobody's
 # business.
 av.logging.set_level(av.logging.ERROR)
@@ -51,7 +53,7 @@ class FFmpegDecoder:
         self.number = 0
         self.coarser = 0.0  # not known yet
 
-    def decode(self, packets: list["av.packet.Packet"]) -> list[tuple["av.packet.Packet", list[Decoded], bool]]:
+    def decode(self, packets: list["av.packet.Packet"]) -> list[Outcome]:
         """The next packets, each with the frames that it completes, and whether it is damaged."""
         # First all decoding, then all else: each time the one has driven the other's code out of the caches.
         decoded = [(packet, *self.decoded(packet)) for packet in packets]

@@ -13,10 +13,10 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from tracking.ffmpeg import FFmpegDecoder, grey, packets_of, quarter_turns
+from tracking.ffmpeg import FFmpegDecoder, Outcome, grey, packets_of, quarter_turns
 from tracking.order import Decoded
 
-PROBED = 5  # first packets, of which one may be refused
+PROBED = 5  # first packets or files, of which one may be refused
 ROUNDED = 1.0  # grey levels by which two decoders of the same code may differ in the mean
 
 
@@ -62,9 +62,9 @@ class JpegDecoder:
                     agreed.append(decoder)
         return agreed[0] if agreed and refused <= 1 else None
 
-    def decode(self, packets: list["av.packet.Packet"]) -> list[tuple["av.packet.Packet", list[Decoded], bool]]:
+    def decode(self, packets: list["av.packet.Packet"]) -> list[Outcome]:
         """Packets, each with the frame in it, and whether it is damaged."""
-        outcomes = []
+        outcomes: list[Outcome] = []
         for packet in packets:
             picture = self.picture(packet) if packet.size and not packet.is_corrupt else None
             frames = [] if picture is None else [Decoded(packet.pts, picture, None)]

@@ -3,6 +3,7 @@
 import re
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import av
@@ -128,21 +129,20 @@ def _quarter_turns(container: "av.container.InputContainer", stream: "av.video.s
 
 
 def _reader_of(pictures: list[Path]) -> Callable[[Path], NDArray | None]:
-    """Gives a file's picture; None where it cannot be read, or is a JPEG with damage that most of them do not have."""
-    begun = [path for path in pictures[:PROBED] if _read_picture(path) is not None]
-    odd = sum(not _is_sound(path) for path in begun)
-    return _read_picture if odd > 1 else lambda path: _read_picture(path) if _is_sound(path) else None
+    """Gives a file's picture; None where it cannot be read, or is a JPEG with damage that the others do not have."""
+    begun = pictures[:PROBED]
+    odd = sum(_read_picture(path) is not None and _read_picture(path, strict=True) is None for path in begun)
+    return partial(_read_picture, strict=odd <= 1)
 
 
-def _read_picture(path: Path) -> NDArray | None:
-    return cv2.imread(str(path), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-
-
-def _is_sound(path: Path) -> bool:
+def _read_picture(path: Path, strict: bool = False) -> NDArray | None:
     try:
-        return path.suffix.lower() not in JPEG_SUFFIXES or is_whole(path.read_bytes())
-    except OSError:
-        return False
+        content = path.read_bytes()
+        if strict and path.suffix.lower() in JPEG_SUFFIXES and not is_whole(content):
+            return None
+        return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+    except (OSError, cv2.error):  # OpenCV's, of files that are empty or claim to be huge
+        return None
 
 
 def _folder_frames(folder: Path) -> Generator[Frame]:

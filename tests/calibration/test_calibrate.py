@@ -103,5 +103,9 @@ def test_bad_input(dot_grid: Path, run: Run, tmp_path: Path) -> None:
     (dot_grid / "board.yaml").write_text(board)
     (dot_grid / "3.png").write_bytes(b"not a picture")
     refused("3.png", "cannot be read")
+    huge = bytearray(cv2.imencode(".bmp", np.zeros((8, 8), np.uint8))[1].tobytes())
+    huge[18:26] = b"\0\0\1\0" * 2  # 65536 px wide and high, it claims; OpenCV goes by content, not by name
+    (dot_grid / "3.png").write_bytes(huge)
+    refused("3.png", "cannot be read")
     cv2.imwrite(str(dot_grid / "3.png"), np.zeros((100, 100), np.uint8))
     refused("pictures of one size", "100 x 100")

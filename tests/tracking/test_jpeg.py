@@ -126,6 +126,18 @@ def test_a_damaged_file_in_a_folder_is_missing(tmp_path: Path, number: int) -> N
             np.testing.assert_array_equal(picture, truth[k])
 
 
+def test_files_that_opencv_gives_up_on_are_missing(tmp_path: Path) -> None:
+    """An empty one, and one whose header claims four thousand million pixels."""
+    folder = folder_of_files(tmp_path)
+    huge = bytearray(cv2.imencode(".bmp", np.zeros((8, 8), np.uint8))[1].tobytes())
+    huge[18:26] = b"\0\0\1\0" * 2
+    (folder / "3.bmp").write_bytes(huge)
+    (folder / "3.jpg").write_bytes(b"")
+    (folder / "4.png").write_bytes(b"")
+    missing = [frame.picture is None for frame in open_video(folder).read()]
+    assert missing == [False] * 3 + [True] * 2 + [False, True] + [False] * (COUNT - 5)
+
+
 def test_bytes_that_a_camera_leaves_in_every_file_are_no_damage(tmp_path: Path) -> None:
     folder = folder_of_files(tmp_path)
     for path in folder.iterdir():
