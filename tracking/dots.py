@@ -234,11 +234,6 @@ def _extents(labels, count):  # type: ignore[no-untyped-def]
     return box, area, centroid / np.maximum(area, 1).reshape(-1, 1)
 
 
-def find_dots(image: NDArray, dark: bool) -> Dots:
-    """All dots of a picture that a disc fits."""
-    return dots_at(image, candidates(image, dark), dark)
-
-
 def dots_at(image: NDArray, start: Array, dark: bool) -> Dots:
     """Those of these candidates (D, 12) that a disc fits, with all their pixels or without what is strange."""
     plain = fit_dots(image, start, wary=False)

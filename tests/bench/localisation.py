@@ -12,7 +12,7 @@ from footage import Row, write_video
 from scipy.optimize import linear_sum_assignment
 
 from tracking.artificial import Scene, draw, expose
-from tracking.dots import find_dots
+from tracking.dots import Dots
 from tracking.family import find_family
 from tracking.follow import follow
 from tracking.video import open_video
@@ -117,7 +117,7 @@ def localisation(random: np.random.Generator, quick: bool) -> Iterator[Row]:
             truths.append((ellipses, smear))
         for picture, (ellipses, smear) in zip(pictures, truths, strict=True):
             found = find_family(picture)
-            dots = found[1] if found is not None else find_dots(picture, True)
+            dots = found[1] if found is not None else Dots.none(0)
             row, column = matched(dots.centre, ellipses[:, :2], 3.0)
             errors.append(dots.centre[row] - ellipses[column, :2])
             sigmas.append(dots.sigma[row])

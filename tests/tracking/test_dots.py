@@ -4,8 +4,12 @@ import pytest
 from support import picture
 
 from tracking.artificial import Scene, draw, expose
-from tracking.dots import Dots, find_dots, find_spots, fit_dots, start_of
+from tracking.dots import Dots, candidates, dots_at, find_spots, fit_dots, start_of
 from tracking.family import find_family
+
+
+def all_dots(image: np.ndarray, dark: bool) -> Dots:
+    return dots_at(image, candidates(image, dark), dark)
 
 
 def nearest(dots: Dots, truth: tuple[float, float]) -> int:
@@ -17,7 +21,7 @@ def nearest(dots: Dots, truth: tuple[float, float]) -> int:
 def test_centres_of_clean_dots(radius: float, dark: bool) -> None:
     """Without noise 8-bit rounding and the light's slope are left: hundredths of a pixel."""
     truth = [(50.3, 60.7, radius, radius, 0.0), (120.15, 90.85, radius, 0.75 * radius, 0.6)]
-    dots = find_dots(picture(truth, dark=dark), dark)
+    dots = all_dots(picture(truth, dark=dark), dark)
     assert len(dots) == 2
     for x, y, a, b, _ in truth:
         k = nearest(dots, (x, y))
@@ -39,7 +43,7 @@ def test_noise_errors_reach_the_bound_and_sigma_says_so() -> None:
             (x + random.uniform(-2, 2), y + random.uniform(-2, 2), 8.0, 8.0, 0.0)
             for x in (30, 80, 130, 170) for y in (30, 80, 130)
         ]  # fmt: skip
-        dots = find_dots(picture(truth, noise=4.0, seed=seed), True)
+        dots = all_dots(picture(truth, noise=4.0, seed=seed), True)
         assert len(dots) == len(truth)
         for x, y, *_ in truth:
             k = nearest(dots, (x, y))
@@ -107,7 +111,7 @@ def drawn(outline: np.ndarray, random: np.random.Generator) -> np.ndarray:
 def test_neighbours_do_not_pull() -> None:
     """Two dots a diameter and a half apart are found where they are."""
     truth = [(80.0, 80.0, 8.0, 8.0, 0.0), (104.0, 80.5, 8.0, 8.0, 0.0)]
-    dots = find_dots(picture(truth), True)
+    dots = all_dots(picture(truth), True)
     for x, y, *_ in truth:
         assert dots.centre[nearest(dots, (x, y))] == pytest.approx((x, y), abs=0.03)
 
@@ -124,6 +128,6 @@ def test_a_dot_is_one_spot(radius: float) -> None:
 
 
 def test_nothing_in_an_empty_picture() -> None:
-    assert len(find_dots(np.full((120, 160), 90, np.uint8), True)) == 0
+    assert len(all_dots(np.full((120, 160), 90, np.uint8), True)) == 0
     noise = np.random.default_rng(0).normal(90, 6, (240, 320)).astype(np.uint8)
-    assert len(find_dots(noise, True)) == 0
+    assert len(all_dots(noise, True)) == 0
