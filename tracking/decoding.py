@@ -17,6 +17,7 @@ from groundwork import InputError
 from tracking.ahead import ahead
 from tracking.ffmpeg import FFmpegDecoder, Outcome, packets_of
 from tracking.frame import Frame
+from tracking.hevc import HevcDecoder
 from tracking.jpeg import JpegDecoder
 from tracking.order import Order, Piece
 
@@ -70,6 +71,9 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
         decoders: list[Decoder]
         if codec.name == "mjpeg" and (jpeg := JpegDecoder.of(path)) is not None:
             decoders = [jpeg.decode] * count
+        elif codec.name == "hevc":
+            cores = os.cpu_count() or 1
+            decoders = [HevcDecoder.of(stream, stack.enter_context(ThreadPoolExecutor(cores)), cores).decode]
         else:
             streams = [stream]
             streams += [stack.enter_context(av.open(str(path))).streams.video[0] for _ in range(1, count)]

@@ -45,7 +45,8 @@ class FFmpegDecoder:
         stream.thread_type = "NONE"
         self.context = stream.codec_context
         self.context.thread_count = 1
-        self.context.options = STRICT
+        # Decoders of AV1 look at the ends of codes only if they are to be strict.
+        self.context.options = STRICT | ({"strict": "1"} if "av1" in self.context.codec.name else {})
         self.copies = self.context.codec.intra_only
         self.tells = self.context.codec.name == "h264"
         self.watched = self.context.codec.name in WRITERS and (self.context.extradata or b"").startswith(b"\1")

@@ -1,0 +1,173 @@
+"""Packets of HEVC turned into pictures by FFmpeg, and looked through for damage that it says nothing of.
+
+It looks neither whether a picture's code ends where the picture does nor whether rows begin where the file says, and
+gives out what it reads in code that no encoder wrote. So each packet is decoded thrice more, on its own and with grey
+in place of the pictures it refers to, since what a code is made up of does not depend on them: as it is; with rows that
+begin where the file says and other bytes after its end, which change nothing; and with other last bytes, which change
+the picture, unless its reader never came to them.
+"""
+
+import queue
+from concurrent.futures import Executor
+from dataclasses import dataclass, field
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking.ffmpeg import FFmpegDecoder, Outcome, grey
+
+# HEVC's record of parameters in a file (ISO/IEC 14496-15, 8.3.3.1): its first byte, and where it says how many bytes
+# tell a unit's length. Streams without it have marks between units and are not looked through.
+VERSION, LENGTHS = b"\1", 21
+# Kinds of units (Rec. ITU-T H.265, table 7-1): those below 32 are parts of pictures, 32 to 34 parameters; decoders
+# leave out 8 and 9 where they begin with them, but not 0 and 1, which are coded alike.
+CODED, PARAMETERS, SKIPPED = 32, range(32, 35), range(8, 10)
+# Of a part, the last bytes that are changed, and in how many ways: the ends of still pictures say so little that one in
+# ten or twenty ways makes no difference.
+ENDS, WAYS = 32, 16
+# A picture comes out though what it refers to is missing, and is not smoothed by how that was said to move.
+ALONE = {"flags": "+output_corrupt", "flags2": "+showall", "skip_loop_filter": "all"}
+
+
+def noise(seed: int) -> bytes:
+    """Bytes that stand for nothing, the same for the same seed, none of which is taken for a mark between units."""
+    return np.random.default_rng(seed).integers(4, 256, 2 * ENDS).astype(np.uint8).tobytes()
+
+
+NOISE = [noise(seed) for seed in range(WAYS)]
+
+
+def kind(unit: bytes) -> int:
+    """What a unit holds."""
+    return unit[0] >> 1 & 63
+
+
+def is_part(unit: bytes) -> bool:
+    """Whether a unit is part of a picture, of the layer that is decoded."""
+    return kind(unit) < CODED and not unit[0] & 1 and not unit[1] >> 3
+
+
+def units_of(content: bytes, length: int) -> list[bytes]:
+    """A packet's units, each of which stands after its length of so many bytes; none where they do not add up."""
+    units, start = [], 0
+    while start < len(content):
+        end = start + length + int.from_bytes(content[start : start + length], "big")
+        if end > len(content) or end < start + length + 2:
+            return []
+        units.append(content[start + length : end])
+        start = end
+    return units
+
+
+@dataclass
+class _Alone:
+    """A decoder that takes each packet for a video of its own."""
+
+    context: "av.video.codeccontext.VideoCodecContext"
+    length: int
+
+    @classmethod
+    def of(cls, parameters: bytes, rows_apart: bool) -> "_Alone":
+        context = av.codec.CodecContext.create("hevc", "r")
+        context.extradata = parameters
+        context.thread_type, context.thread_count = ("SLICE", 2) if rows_apart else ("NONE", 1)
+        context.options = ALONE
+        return cls(context, 1 + (parameters[LENGTHS] & 3))
+
+    def picture(self, units: list[bytes]) -> NDArray | None:
+        packet = av.Packet(b"".join(len(unit).to_bytes(self.length, "big") + unit for unit in units))
+        with av.logging.Capture(local=True):
+            try:
+                frames = [*self.context.decode(packet), *self.context.decode(None)]
+            except av.FFmpegError:
+                frames = []
+            self.context.flush_buffers()
+        return grey(frames[-1], copy=True) if frames else None
+
+
+class _Looker:
+    """Finds damage that decoders read in silence."""
+
+    def __init__(self, parameters: bytes) -> None:
+        self.rows_on, self.rows_apart = _Alone.of(parameters, False), _Alone.of(parameters, True)
+
+    def is_sound(self, units: list[bytes]) -> bool:
+        """Whether a picture's code is read to its end and no further; True where its decoder has no picture."""
+        plain = self.rows_on.picture([unit + NOISE[0] if is_part(unit) else unit for unit in units])
+        if plain is None:
+            return True
+        again = self.rows_apart.picture([unit + NOISE[1] if is_part(unit) else unit for unit in units])
+        if again is None or not np.array_equal(plain, again):
+            return False
+        return all(self._reads_to_its_end(units, part, plain) for part, unit in enumerate(units) if is_part(unit))
+
+    def _reads_to_its_end(self, units: list[bytes], part: int, plain: NDArray) -> bool:
+        """Whether the picture changes with that part's last bytes."""
+        code = units[part].rstrip(b"\0\3")  # what may stand there for no reason but the rate
+        some = min(ENDS, len(code) // 2)
+        for other in NOISE:
+            changed = self.rows_on.picture([*units[:part], code[:-some] + other, *units[part + 1 :]])
+            if changed is None or not np.array_equal(plain, changed):
+                return True
+        return False
+
+
+@dataclass
+class HevcDecoder:
+    """FFmpeg's decoder and those that look through what it decodes.
+
+    Attributes:
+        first: whose pictures are taken.
+        pool: where packets are looked through meanwhile.
+        idle: who can.
+        length: of how many bytes the length of a unit is; 0 where units are not told apart.
+        parameters: units that what comes next is decoded by, beside those at the file's beginning.
+    """
+
+    first: FFmpegDecoder
+    pool: Executor
+    idle: "queue.SimpleQueue[_Looker]"
+    length: int
+    parameters: list[bytes] = field(default_factory=list)
+
+    @classmethod
+    def of(cls, stream: "av.video.stream.VideoStream", pool: Executor, threads: int) -> "HevcDecoder":
+        """Of a stream that nothing else reads; its packets are looked through by so many threads of a pool."""
+        first = FFmpegDecoder(stream)
+        record = first.context.extradata or b""
+        length = 1 + (record[LENGTHS] & 3) if record.startswith(VERSION) and len(record) > LENGTHS else 0
+        idle: queue.SimpleQueue[_Looker] = queue.SimpleQueue()
+        for _ in range(threads if length else 0):
+            idle.put(_Looker(record))
+        return cls(first, pool, idle, length)
+
+    def decode(self, packets: list["av.packet.Packet"]) -> list[Outcome]:
+        """The next packets, each with the frames that it completes, and whether it is damaged."""
+        looks = [self.pool.submit(self._is_sound, self._units(packet)) for packet in packets]
+        outcomes = self.first.decode(packets)
+        return [
+            (packet, frames, damaged or not look.result())
+            for (packet, frames, damaged), look in zip(outcomes, looks, strict=True)
+        ]
+
+    def _units(self, packet: "av.packet.Packet") -> list[bytes]:
+        """What a packet's picture is decoded from on its own; nothing where that is not known."""
+        if packet.has_sidedata("new_extradata"):
+            self.length = 0
+        units = units_of(bytes(packet), self.length) if self.length else []
+        if packet.is_keyframe:
+            self.parameters = []
+        self.parameters += [unit for unit in units if kind(unit) in PARAMETERS]
+        parts = [unit for unit in units if is_part(unit)]
+        parts = [bytes([unit[0] - (8 << 1)]) + unit[1:] if kind(unit) in SKIPPED else unit for unit in parts]
+        return [*self.parameters, *parts] if parts else []
+
+    def _is_sound(self, units: list[bytes]) -> bool:
+        if not units:
+            return True
+        looker = self.idle.get()
+        try:
+            return looker.is_sound(units)
+        finally:
+            self.idle.put(looker)
