@@ -20,6 +20,7 @@ from tracking.frame import Frame
 from tracking.hevc import HevcDecoder
 from tracking.jpeg import JpegDecoder
 from tracking.order import Order, Piece
+from tracking.units import Renewals, Units
 
 Decoder = Callable[[list["av.packet.Packet"]], list[Outcome]]
 
@@ -78,9 +79,12 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
             streams = [stream]
             streams += [stack.enter_context(av.open(str(path))).streams.video[0] for _ in range(1, count)]
             decoders = [FFmpegDecoder(each).decode for each in streams]
+        renewals = Renewals(Units.of("h264", stream.codec_context.extradata)) if codec.name == "h264" else None
         for packet, frames, damaged in _all_decoded(packets_of(container, stream, notes), decoders):
             stamp = packet.pts if packet.size else None
-            yield Piece(stamp, packet.is_keyframe, float(packet.time_base), frames, damaged)
+            since = (0 if packet.is_keyframe else None) if renewals is None else renewals.since(packet)
+            unstamped = packet.size > 0 and stamp is None
+            yield Piece(stamp, since is not None, float(packet.time_base), frames, damaged, since or 0, unstamped)
 
 
 def _decoders_worth(path: Path) -> int:

@@ -16,10 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking.ffmpeg import FFmpegDecoder, Outcome, grey
+from tracking.units import Units
 
-# HEVC's record of parameters in a file (ISO/IEC 14496-15, 8.3.3.1): its first byte, and where it says how many bytes
-# tell a unit's length. Streams without it have marks between units and are not looked through.
-VERSION, LENGTHS = b"\1", 21
 # Kinds of units (Rec. ITU-T H.265, table 7-1): those below 32 are parts of pictures, 32 to 34 parameters; decoders
 # leave out 8 and 9 where they begin with them, but not 0 and 1, which are coded alike.
 CODED, PARAMETERS, SKIPPED = 32, range(32, 35), range(8, 10)
@@ -48,35 +46,24 @@ def is_part(unit: bytes) -> bool:
     return kind(unit) < CODED and not unit[0] & 1 and not unit[1] >> 3
 
 
-def units_of(content: bytes, length: int) -> list[bytes]:
-    """A packet's units, each of which stands after its length of so many bytes; none where they do not add up."""
-    units, start = [], 0
-    while start < len(content):
-        end = start + length + int.from_bytes(content[start : start + length], "big")
-        if end > len(content) or end < start + length + 2:
-            return []
-        units.append(content[start + length : end])
-        start = end
-    return units
-
-
 @dataclass
 class _Alone:
     """A decoder that takes each packet for a video of its own."""
 
     context: "av.video.codeccontext.VideoCodecContext"
-    length: int
+    units: Units
 
     @classmethod
-    def of(cls, parameters: bytes, rows_apart: bool) -> "_Alone":
+    def of(cls, parameters: bytes | None, units: Units, rows_apart: bool) -> "_Alone":
         context = av.codec.CodecContext.create("hevc", "r")
-        context.extradata = parameters
+        if parameters:
+            context.extradata = parameters
         context.thread_type, context.thread_count = ("SLICE", 2) if rows_apart else ("NONE", 1)
         context.options = ALONE
-        return cls(context, 1 + (parameters[LENGTHS] & 3))
+        return cls(context, units)
 
     def picture(self, units: list[bytes]) -> NDArray | None:
-        packet = av.Packet(b"".join(len(unit).to_bytes(self.length, "big") + unit for unit in units))
+        packet = av.Packet(self.units.joined(units))
         with av.logging.Capture(local=True):
             try:
                 frames = [*self.context.decode(packet), *self.context.decode(None)]
@@ -89,8 +76,8 @@ class _Alone:
 class _Looker:
     """Finds damage that decoders read in silence."""
 
-    def __init__(self, parameters: bytes) -> None:
-        self.rows_on, self.rows_apart = _Alone.of(parameters, False), _Alone.of(parameters, True)
+    def __init__(self, parameters: bytes | None, units: Units) -> None:
+        self.rows_on, self.rows_apart = (_Alone.of(parameters, units, rows_apart) for rows_apart in (False, True))
 
     def is_sound(self, units: list[bytes]) -> bool:
         """Whether a picture's code is read to its end and no further; True where its decoder has no picture."""
@@ -121,41 +108,42 @@ class HevcDecoder:
         first: whose pictures are taken.
         pool: where packets are looked through meanwhile.
         idle: who can.
-        length: of how many bytes the length of a unit is; 0 where units are not told apart.
+        units: how to tell them apart.
         parameters: units that what comes next is decoded by, beside those at the file's beginning.
+        renewed: the file gave others for its beginning's; what comes after is not looked through.
     """
 
     first: FFmpegDecoder
     pool: Executor
     idle: "queue.SimpleQueue[_Looker]"
-    length: int
+    units: Units
     parameters: list[bytes] = field(default_factory=list)
+    renewed: bool = False
 
     @classmethod
     def of(cls, stream: "av.video.stream.VideoStream", pool: Executor, threads: int) -> "HevcDecoder":
         """Of a stream that nothing else reads; its packets are looked through by so many threads of a pool."""
         first = FFmpegDecoder(stream)
-        record = first.context.extradata or b""
-        length = 1 + (record[LENGTHS] & 3) if record.startswith(VERSION) and len(record) > LENGTHS else 0
+        parameters = first.context.extradata
+        units = Units.of("hevc", parameters)
         idle: queue.SimpleQueue[_Looker] = queue.SimpleQueue()
-        for _ in range(threads if length else 0):
-            idle.put(_Looker(record))
-        return cls(first, pool, idle, length)
+        for _ in range(threads):
+            idle.put(_Looker(parameters, units))
+        return cls(first, pool, idle, units)
 
     def decode(self, packets: list["av.packet.Packet"]) -> list[Outcome]:
         """The next packets, each with the frames that it completes, and whether it is damaged."""
-        looks = [self.pool.submit(self._is_sound, self._units(packet)) for packet in packets]
+        looks = [self.pool.submit(self._is_sound, self._needed(packet)) for packet in packets]
         outcomes = self.first.decode(packets)
         return [
             (packet, frames, damaged or not look.result())
             for (packet, frames, damaged), look in zip(outcomes, looks, strict=True)
         ]
 
-    def _units(self, packet: "av.packet.Packet") -> list[bytes]:
-        """What a packet's picture is decoded from on its own; nothing where that is not known."""
-        if packet.has_sidedata("new_extradata"):
-            self.length = 0
-        units = units_of(bytes(packet), self.length) if self.length else []
+    def _needed(self, packet: "av.packet.Packet") -> list[bytes]:
+        """The units that a packet's picture is decoded from on its own; none where that is not known."""
+        self.renewed |= packet.has_sidedata("new_extradata")
+        units = [] if self.renewed else self.units.split(bytes(packet))
         if packet.is_keyframe:
             self.parameters = []
         self.parameters += [unit for unit in units if kind(unit) in PARAMETERS]

@@ -1,6 +1,7 @@
 """Frames in the order in which they are shown; those that damage has spoilt without a picture."""
 
 import heapq
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -33,11 +34,13 @@ class Piece:
     """What a packet says of the frame in it, and what came out of the decoder after it.
 
     Attributes:
-        stamp: when its frame is shown, in the stream's own unit; None where it does not say, or holds none.
-        key: whether its frame is decoded without others.
+        stamp: when its frame is shown, in the stream's own unit; None where it does not say.
+        key: whether nothing before its frame is needed for those that are shown after it.
         unit: of the stamp [s].
         frames: those that were ready.
         complained: whether the decoder found damage.
+        since: how many packets before a key frame's it needs, where pictures are renewed bit by bit.
+        unstamped: holds a frame without a stamp.
     """
 
     stamp: int | None
@@ -45,6 +48,8 @@ class Piece:
     unit: float
     frames: list[Decoded]
     complained: bool
+    since: int = 0
+    unstamped: bool = False
 
     def size(self) -> int:
         """Of its pictures [bytes]."""
@@ -57,14 +62,13 @@ class _Packet:
 
     Attributes:
         number: in the order of decoding.
-        group: key frames up to and with this one.
-        leading: shown before the key frame of its group, so that it may refer to the group before.
+        first: the number of the earliest that it may refer to: its group's key frame, or, if it is shown before that,
+            the key frame before.
         last: the latest time stamp of all that were decoded up to it.
     """
 
     number: int
-    group: int
-    leading: bool
+    first: int
     last: int
 
 
@@ -73,8 +77,8 @@ class Order:
     """Puts frames into the order in which they are shown, each in its slot.
 
     Every packet has a slot by its time stamp. A frame that comes out of the decoder fills its own; slots before it
-    that are still empty were lost, and what comes for them later is dropped. A damaged frame spoils those of its group
-    that were decoded after it. Some decoders own up to damage only when the frame comes out, and frames that refer to
+    that are still empty were lost, and what comes for them later is dropped. A damaged frame spoils those decoded after
+    it that may refer to it. Some decoders own up to damage only when the frame comes out, and frames that refer to
     it may be shown before it: none is given on before all that were decoded before it are out.
     """
 
@@ -82,10 +86,14 @@ class Order:
     waiting: list[int] = field(default_factory=list)
     held: deque[Decoded] = field(default_factory=deque)
     gone: set[int] = field(default_factory=set)  # stamps of lost slots
-    broken: dict[int, int] = field(default_factory=dict)  # by group, the first damaged packet
+    damaged: list[int] = field(default_factory=list)  # numbers of packets, in their order
     count: int = 0
-    group: int = 0
-    key: int | None = None
+    first: int = 0  # that frames from the last key frame on may refer to
+    before: int = 0  # that those shown before it may
+    key: int | None = None  # the last one's stamp
+    key_number: int = 0
+    unstamped: int = 0  # frames without stamps that are to come
+    depth: int = 0  # the most of them before any was damaged
     last: int | None = None  # latest stamp of all packets
     start: int | None = None
     base: float = 0.0  # seconds in a unit of the stamps
@@ -99,29 +107,35 @@ class Order:
                 self._spoil(piece.stamp)
             while piece.frames:
                 yield from self._shown(piece.frames.pop(0))
+            if not self.damaged:
+                self.depth = max(self.depth, self.unstamped)
+            yield from self._overdue(self.depth)
         while self.held:
             yield from self._given_on(self.held.popleft())
         yield from self._lost(None)
+        yield from self._overdue(0)
 
     def _expect(self, piece: Piece) -> None:
         """Takes note of a packet whose frame is to come out."""
         stamp = piece.stamp
         self.base = self.base or piece.unit
-        if piece.key:
-            self.group += 1
-            self.key = stamp
         self.count += 1
+        self.unstamped += piece.unstamped
+        if piece.key:
+            self.before, self.first = self.first, self.count - piece.since
+            self.key, self.key_number = stamp, self.count
         if stamp is not None:
             self.last = stamp if self.last is None else max(self.last, stamp)
             leading = self.key is not None and stamp < self.key
-            self.packets[stamp] = _Packet(self.count, self.group, leading, self.last)
+            self.packets[stamp] = _Packet(self.count, self.before if leading else self.first, self.last)
             heapq.heappush(self.waiting, stamp)
 
     def _spoil(self, stamp: int | None) -> None:
         """What is stamped so is damaged; without a stamp, what was decoded last."""
         packet = None if stamp is None else self.packets.get(stamp)
-        number, group = (self.count, self.group) if packet is None else (packet.number, packet.group)
-        self.broken[group] = min(number, self.broken.get(group, number))
+        number = self.count if packet is None else packet.number
+        if number not in self.damaged[-1:]:
+            insort(self.damaged, number)
 
     def _shown(self, frame: Decoded) -> Iterator[Frame]:
         """The frames that can be given on once this one is out."""
@@ -140,7 +154,8 @@ class Order:
 
     def _given_on(self, frame: Decoded) -> Iterator[Frame]:
         if frame.stamp is None:
-            sound = self.group not in self.broken
+            self.unstamped -= 1
+            sound = self._is_sound(None)
             yield Frame(np.nan, frame.picture if sound else None, frame.steps if sound else None)
             return
         yield from self._lost(frame.stamp)
@@ -148,11 +163,10 @@ class Order:
         yield Frame(self._time(frame.stamp), frame.picture if sound else None, frame.steps if sound else None)
 
     def _is_sound(self, packet: _Packet | None) -> bool:
-        if packet is None:
-            return self.group not in self.broken
-        if packet.leading and packet.group - 1 in self.broken:
-            return False
-        return packet.number < self.broken.get(packet.group, packet.number + 1)
+        if packet is None:  # it may be one that was decoded before the last key frame
+            packet = _Packet(self.count, self.first if self.count - self.key_number > DEEPEST else self.before, 0)
+        place = bisect_left(self.damaged, packet.first)
+        return place == len(self.damaged) or self.damaged[place] > packet.number
 
     def _lost(self, stamp: int | None) -> Iterator[Frame]:
         """The slots before `stamp`, or all that are left."""
@@ -163,6 +177,12 @@ class Order:
             yield Frame(self._time(lost), None)
         if self.waiting and self.waiting[0] == stamp:
             heapq.heappop(self.waiting)
+
+    def _overdue(self, depth: int) -> Iterator[Frame]:
+        """Frames without stamps, once damaged ones are among them, of which more are to come than ever before."""
+        while self.damaged and self.unstamped > depth:
+            self.unstamped -= 1
+            yield Frame(np.nan, None)
 
     def _time(self, stamp: int) -> float:
         if self.start is None:

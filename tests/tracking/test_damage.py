@@ -121,9 +121,11 @@ def test_zeros_that_a_program_writes_after_every_picture_are_no_damage(tmp_path:
         np.testing.assert_array_equal(picture, before)
 
 
-def moving_texture(random: np.random.Generator) -> list[np.ndarray]:
+def moving_texture(random: np.random.Generator, count: int = 20) -> list[np.ndarray]:
+    """To and fro by 2 px a frame."""
     texture = cv2.GaussianBlur(random.uniform(0, 255, (150, 200)).astype(np.float32), (0, 0), 2.0) * 3.0 - 255.0
-    pictures = [texture[8:136, 2 * k : 2 * k + 160] + random.normal(0.0, 6.0, (128, 160)) for k in range(20)]
+    places = [2 * abs((k + 19) % 38 - 19) for k in range(count)]
+    pictures = [texture[8:136, place : place + 160] + random.normal(0.0, 6.0, (128, 160)) for place in places]
     return [np.clip(picture, 0, 255).astype(np.uint8) for picture in pictures]
 
 
@@ -182,3 +184,27 @@ def test_what_decoders_read_in_silence_is_hardly_ever_taken(
         bit = bytes([packets[packet][start] ^ 1 << int(random.integers(8))])
         copies += lost_and_wrong(path, packet, start, bit if number % 2 else some)[1] > 0
     assert copies <= most
+
+
+@pytest.mark.parametrize("others", ["bframes=0", "bframes=2"])
+def test_pictures_that_are_renewed_column_by_column_come_back_whole(tmp_path: Path, others: str) -> None:
+    """H.264 without key frames but the first: the packet that begins a renewal passes for one."""
+    path = tmp_path / "a.mp4"
+    random = np.random.default_rng(7)
+    options = {"crf": "20", "x264-params": f"intra-refresh=1:keyint=20:{others}"}
+    write_video(path, "libx264", "yuv420p", options=options, pictures=moving_texture(random, 80))
+    lost, wrong = np.transpose([lost_and_wrong(path, packet, 8, random.bytes(12)) for packet in range(5, 30, 4)])
+    assert 8 < np.median(lost) < 50
+    assert not wrong.any()
+
+
+def test_a_stream_without_times_keeps_a_slot_for_every_frame(tmp_path: Path) -> None:
+    """H.264 as small cameras write it, without a container: what comes after a lost frame is not taken for it."""
+    path = tmp_path / "a.h264"
+    random = np.random.default_rng(8)
+    options = {"crf": "20", "g": "10", "bf": "0"}
+    write_video(path, "libx264", "yuv420p", options=options, pictures=moving_texture(random, 40))
+    lost, wrong = np.transpose([lost_and_wrong(path, packet, 40, random.bytes(12)) for packet in range(4, 36, 3)])
+    assert lost.all()
+    assert lost.max() < 36
+    assert not wrong.any()
