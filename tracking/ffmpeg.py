@@ -35,7 +35,7 @@ STEPS = 0.625 * 2.0 ** (np.arange(-64, 128) / 6.0)  # by quantiser, from -64
 # them where it searched no more thoroughly than that (its `subme`). Measured on seven presets at crf 23: in a hurry it
 # lets everything lag.
 SEARCHED = re.compile(rb"x264 - core.{,400}? subme=(\d{1,2}) ", re.DOTALL)
-COARSER = ((2, 2.2), (6, 1.4))
+COARSER = ((2, 2.4), (6, 1.4))
 
 
 class FFmpegDecoder:

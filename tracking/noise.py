@@ -12,14 +12,20 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-# Errors of coded pictures beside those that independent errors of one step in each pixel would make: along an axis in
-# which the marker keeps still, and along its way, where the encoder lets it lag. Measured on libx264, crf 18 to 28,
-# dots of 8 px, medium preset; of quicker ones the decoding tells larger steps.
-STILL, LAGGING = 0.45, 1.0
-# The share of these errors' variance that all markers have in common: of markers that move far from frame to frame,
-# and how much more before and after frames to which they move less than SLOW of these errors: where they turn round,
-# they wait together until the encoder takes notice. Measured likewise.
-COMMON, WAITING, SLOW = 0.05, 0.6, 5.0
+# Errors of coded pictures: along an axis in which the marker keeps still, against the fit's own, which takes errors of
+# neighbouring pixels for independent; and along its way [px], where the encoder lets it lag, of what independent errors
+# of one step in each pixel would make, to a power. Measured on 115 films: libx264, crf 12 to 28, medium preset, noise
+# of 1.5 to 5 grey levels, dots of 6 to 11 px, contrasts of 35 to 150; of quicker presets the decoding tells larger
+# steps.
+STILL, LAGGING, POWER = 1.69, 0.346, 0.664
+# Of these errors' variance, what all markers have in common against what each has alone: times the square of the step
+# over the noise of the first picture, and by so many powers of e more before and after frames to which a marker moves
+# less than SLOW of these errors: where markers turn round, they wait together until the encoder takes notice. Measured
+# likewise.
+SHARED, WAITING, SLOW = 0.009, 3.0, 5.0
+# So many times the variance of these errors may still be error, not the body's own motion; and so many times the errors
+# themselves may, together, pass for a mode of it.
+EXCESS, PASSING = 2.0, 2.0
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
 MODES = 12  # of the body's motion, at most
 SPARE = 8  # further ones, of which those of the other markers may need a little
@@ -42,16 +48,16 @@ def places_and_errors(pixel: Array, fitted: Array, leverage: Array, step: Array)
             not known.
         step: by which the picture was rounded there [grey levels], (T, D), NaN where not known: as in other frames.
     """
-    coding = coding_errors(pixel, leverage, step)
+    coding = coding_errors(pixel, fitted, leverage, step)
     expected = np.maximum(fitted, coding)
-    others = Others.of(pixel, expected)
+    others = Others.of(pixel, np.maximum(fitted, PASSING * coding))
     if others is None:
         return pixel, expected
-    off, mended = mendable(pixel, fitted, coding, others)
+    off, mended = mendable(pixel, fitted, coding, others, coarseness(fitted, leverage, step))
     return pixel - off, np.where(np.isnan(mended), with_shared_errors(expected, others), mended)
 
 
-def coding_errors(pixel: Array, leverage: Array, step: Array) -> Array:
+def coding_errors(pixel: Array, fitted: Array, leverage: Array, step: Array) -> Array:
     """Standard deviations (T, D, 2) that the coding of the pictures leads one to expect [px]; 0 where nothing is known.
 
     An encoder passes over changes below its step: a dot that moves a little stays where it was, and the picture it
@@ -60,12 +66,25 @@ def coding_errors(pixel: Array, leverage: Array, step: Array) -> Array:
     told = np.isfinite(step)
     square = np.nansum(step**2, axis=0) / np.maximum(told.sum(axis=0), 1)
     usual = np.where(told.any(axis=0), square, np.nansum(step**2) / max(told.sum(), 1)) ** 0.5
-    still = STILL * np.nan_to_num(leverage * np.where(told, step, usual)[..., None])
+    rounded = np.nan_to_num(leverage * np.where(told, step, usual)[..., None])
+    still = np.where(rounded > 0.0, STILL * np.nan_to_num(fitted), 0.0)
     count = np.maximum(np.isfinite(pixel).sum(axis=0), 1)
     mean = np.nansum(pixel, axis=0) / count
     spread = np.nansum((pixel - mean) ** 2, axis=0) / count
     moves = spread > 4.0 * (still**2).sum(axis=0) / count
-    return np.where(moves, LAGGING / STILL, 1.0) * still
+    return np.where(moves, np.maximum(LAGGING * rounded**POWER, still), still)
+
+
+def coarseness(fitted: Array, leverage: Array, step: Array) -> float:
+    """The steps over the noise that the first picture shows, the finest coded; 0 where nothing is known.
+
+    Noise keeps an encoder from passing over the same change everywhere. Arguments as for `places_and_errors`.
+    """
+    told, noise = np.isfinite(step), fitted / leverage
+    shows = np.flatnonzero(np.isfinite(noise).any(axis=(1, 2)))
+    if not told.any() or not len(shows):
+        return 0.0
+    return float(np.sqrt(np.mean(step[told] ** 2)) / np.nanmedian(noise[shows[0]]))
 
 
 @dataclass(frozen=True)
@@ -166,7 +185,7 @@ def with_shared_errors(sigma: Array, others: Others) -> Array:
     return whole
 
 
-def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tuple[Array, Array]:
+def mendable(pixel: Array, fitted: Array, coding: Array, others: Others, coarse: float) -> tuple[Array, Array]:
     """What of the places is coding's error, by the others' motion, and standard deviations without it [px], (T, D, 2).
 
     The best mean of two places of known variances, the measured one and the others'. Zero and NaN where nothing is
@@ -177,22 +196,28 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others) -> tupl
         fitted: standard deviations from the fits [px], (T, D, 2).
         coding: those by coding [px], (T, D, 2).
         others: motion of these paths.
+        coarse: as `coarseness` has it.
     """
     where = np.ix_(others.frames, others.markers)
     square, shown = coding[where] ** 2, fitted[where] ** 2
-    whole = np.maximum(square, shown)
     usual = np.maximum(square.mean(axis=0), 1e-12).sum(axis=1, keepdims=True)
     way = np.pad((np.diff(pixel, axis=0) ** 2).sum(axis=2), ((1, 1), (0, 0)), constant_values=np.nan)
     way = np.nan_to_num(np.fmax(way[:-1], way[1:])[where])[..., None]  # to this frame or the next
     waiting = usual / (usual + np.maximum(way - usual, 0.0) / SLOW**2)  # 1 where a marker keeps still, 0 where it flies
-    common = COMMON + WAITING * waiting
-    shared = common * (whole - shown)
-    own = np.where(square > 0.0, whole - shared, 0.0)
-    # What the others do not tell of the body's motion, and what their errors and its own make of their prediction.
-    share = (others.leverage / (1.0 - others.leverage))[..., None]
-    least = (others.carried + share) * whole.mean(axis=0)
+    alone = 1.0 / (1.0 + SHARED * coarse**2 * np.exp(WAITING * waiting))
+    # What the others do not tell of the body's motion, and what their errors make of their prediction.
+    carried = others.carried + (others.leverage / (1.0 - others.leverage))[..., None]
+
+    def errors(variance: Array) -> tuple[Array, Array, Array]:
+        """Variances of a marker's own errors, of those it shares, and of the others' prediction."""
+        hidden = np.maximum(variance - shown, 0.0)
+        own = np.where(square > 0.0, shown + alone * hidden, 0.0)
+        return own, (1.0 - alone) * hidden, carried * (shown + hidden).mean(axis=0)
+
+    own, _, least = errors(EXCESS * square)
     beyond = np.maximum(others.missed - own.mean(axis=0), 0.0)
     part = own / np.maximum(own + np.maximum(beyond, least), (others.away / SURPRISING) ** 2)
+    own, shared, least = errors(square)
     # Where the others leave less of all paths together than these errors would be, the errors are smaller; but for
     # markers that keep still, whose errors keep still with them and are not seen.
     left = (others.missed / (1.0 + others.carried)).mean(axis=0)
