@@ -62,6 +62,27 @@ def picture(
     return np.clip(np.rint(level + np.random.default_rng(seed).normal(0, noise, level.shape)), 0, 255).astype(np.uint8)
 
 
+def hand_drawn(random: np.random.Generator, radius: float, waves: float) -> np.ndarray:
+    """The outline (180, 2) of a dot drawn by hand about (0, 0), irregular by that share of its radius."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)
+    distance = np.full(180, radius)
+    for k in range(2, 9):
+        distance += radius * waves * random.normal() / k**0.7 * np.cos(k * turn + random.uniform(0, 2 * np.pi))
+    return distance[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+
+
+def outlined(outlines: list[np.ndarray], size: tuple[int, int], random: np.random.Generator) -> np.ndarray:
+    """Dark polygons (N, 2) on light skin, which the picture's edge may cut, blurred by 1 px, with noise."""
+    n, pad = 6, 24
+    width, height = size[0] + 2 * pad, size[1] + 2 * pad
+    fine = np.zeros((height * n, width * n), np.uint8)
+    for outline in outlines:
+        cv2.fillPoly(fine, [np.rint(((outline + pad + 0.5) * n - 0.5) * 256).astype(np.int32)], 255, shift=8)
+    share = cv2.GaussianBlur(fine / 255.0, (0, 0), n).reshape(height, n, width, n).mean(axis=(1, 3))
+    level = 170.0 - 120.0 * share[pad:-pad, pad:-pad]
+    return np.clip(np.rint(level + random.normal(0.0, 2.0, level.shape)), 0, 255).astype(np.uint8)
+
+
 def zero_crossing_frequency(z: np.ndarray, time_step: float) -> float:
     """Of an oscillation about zero [Hz], from its first to its last upward crossing."""
     before = np.flatnonzero((z[:-1] < 0) & (z[1:] >= 0))

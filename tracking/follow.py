@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from groundwork import InputError
 from tracking.affine import carry
+from tracking.cut import WholeLooks
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, eight_bits, find_spots, fit_dots, start_of
 from tracking.family import Family, find_family
@@ -88,7 +89,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
             most = max(most, 0 if found is None else len(found[1]))
             if found is not None and len(found[1]) >= FEWEST_MARKERS:
                 tracker = Tracker(*found)
-                sight = Sight.of(found[1], frame)
+                sight = Sight.of(tracker.looks.judge(frame.picture, found[1]), frame)
         elif frame.picture is not None and tracker is not None:
             sight = Sight.of(tracker.advance(frame.picture), frame)
             late += tracker.look_out(len(times) - 1, frame.picture)
@@ -194,6 +195,7 @@ class Tracker:
         self.missing = np.zeros(len(first), dtype=np.int64)  # frames since each was seen
         self.searched = 0  # frames since the last search
         self.newcomers = Newcomers(family)
+        self.looks = WholeLooks.none(len(first))
 
     def advance(self, image: NDArray) -> Dots:
         """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
@@ -207,7 +209,7 @@ class Tracker:
             better = dots is None or np.isfinite(found.sigma[:, 0]).sum() > np.isfinite(dots.sigma[:, 0]).sum()
             dots = found if better or dots is None else dots
             self.searched = 0
-        dots = _only(dots, self._undisputed(dots))
+        dots = self.looks.judge(image, _only(dots, self._undisputed(dots)))
         self._learn(dots)
         return dots
 
@@ -227,6 +229,7 @@ class Tracker:
                 places[-1] = newcomer.seen[number][0]
             self.motion.join(places)
             self.memory.join(newcomer.rest)
+            self.looks.join()
             self.pattern = Pattern.of(np.concatenate([rest, newcomer.rest[None]]))
             self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
             self.missing = np.append(self.missing, 0 if number in newcomer.seen else 1)

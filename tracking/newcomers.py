@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tracking.affine import carry
+from tracking.cut import doubted
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, find_spots, fit_dots, start_of
 from tracking.family import Family
@@ -139,7 +140,7 @@ class Newcomers:
             expected = carry(pattern.rest[: len(place)], place, rest[None])
             near = np.argsort(np.linalg.norm(place - expected, axis=1))[:NEIGHBOURS]
             starts = np.concatenate([_starts(expected, parameters), _moved(parameters[near], place[near])])
-            dots = fit_dots(image, starts, 1)
+            dots = doubted(image, fit_dots(image, starts, 1))
             since += number >= candidate.since
             if self._admitted(dots)[0] and np.linalg.norm(dots.centre[0] - expected[0]) < same:
                 seen[number] = dots.centre[0], dots.sigma[0]

@@ -1,7 +1,6 @@
-import cv2
 import numpy as np
 import pytest
-from support import picture
+from support import hand_drawn, outlined, picture
 
 from tracking.artificial import Scene, draw, expose
 from tracking.dots import Dots, candidates, dots_at, find_spots, fit_dots, start_of
@@ -82,30 +81,18 @@ def test_sigma_knows_of_highlights(skin: float, dot: float) -> None:
 def test_dots_drawn_by_hand_keep_their_places() -> None:
     """Outlines that wave by a tenth of the radius, or are smooth: how far they scatter while they move."""
     random = np.random.default_rng(4)
-    turn = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)
     scatter = []
     for waves in (0.0, 0.12):
         for _ in range(8):
-            radius = np.full(180, 8.0)
-            for k in range(2, 9):
-                radius += 8.0 * waves * random.normal() / k**0.7 * np.cos(k * turn + random.uniform(0, 2 * np.pi))
-            outline = radius[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+            outline = hand_drawn(random, 8.0, waves)
             places = 30.0 + np.linspace(0.0, 3.0, 25)[:, None] * (1.0, 0.3)
             shape = np.array([1 / 8.0, 0.0, 1 / 8.0])
             starts = [start_of(*place, shape, -120.0, 170.0)[None] for place in places]
-            pictures = [drawn(outline + place, random) for place in places]
+            pictures = [outlined([outline + place], (60, 60), random) for place in places]
             found = [fit_dots(*each).centre[0] for each in zip(pictures, starts, strict=True)]
             scatter.append((found - places).std(axis=0))
     smooth, waved = (np.sqrt((np.array(half) ** 2).mean()) for half in (scatter[:8], scatter[8:]))
     assert waved < 2.7 * smooth
-
-
-def drawn(outline: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """A dark polygon (N, 2) on light skin, 60 px square, blurred by 1 px."""
-    fine = np.zeros((360, 360), np.uint8)
-    cv2.fillPoly(fine, [np.rint(((outline + 0.5) * 6 - 0.5) * 256).astype(np.int32)], 255, shift=8)
-    share = cv2.GaussianBlur(fine / 255.0, (0, 0), 6.0).reshape(60, 6, 60, 6).mean(axis=(1, 3))
-    return np.clip(np.rint(170.0 - 120.0 * share + random.normal(0.0, 2.0, share.shape)), 0, 255).astype(np.uint8)
 
 
 def test_neighbours_do_not_pull() -> None:
