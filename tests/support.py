@@ -42,7 +42,7 @@ def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> Non
 
 def picture(
     dots: list[tuple[float, float, float, float, float]], size: tuple[int, int] = (200, 160), dark: bool = True,
-    blur: float = 1.0, noise: float = 0.0, seed: int = 0,
+    blur: float = 1.0, noise: float = 0.0, seed: int = 0, contrast: float = 130.0,
 ) -> np.ndarray:  # fmt: skip
     """Ellipses (x, y, long and short semi-axis, angle) drawn much finer and averaged down."""
     n = 8
@@ -56,8 +56,7 @@ def picture(
         inside = ((along / a) ** 2 + (across / b) ** 2 < 1).astype(float)
         part = cv2.resize(inside, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
         cover[top:bottom, left:right] = np.maximum(cover[top:bottom, left:right], part)
-    low, high = (170.0, 40.0) if dark else (60.0, 200.0)
-    level = low + (high - low) * cv2.GaussianBlur(cover, (0, 0), blur)
+    level = (170.0 if dark else 60.0) + (-contrast if dark else contrast) * cv2.GaussianBlur(cover, (0, 0), blur)
     level *= 1.0 + 0.001 * np.arange(size[0])  # light from the right
     return np.clip(np.rint(level + np.random.default_rng(seed).normal(0, noise, level.shape)), 0, 255).astype(np.uint8)
 

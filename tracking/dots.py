@@ -24,7 +24,7 @@ LEAST_CONTRAST = 12.0  # grey levels
 LEAST_SIGMA = 1e-3  # px: below it the model's own error counts
 SHARED_NOISE = 1.25  # variance by blocks over that by independent errors, beyond which errors are shared
 ENOUGH_FOR_TWO = 64  # dots, to fit half of them in another thread; with fewer, decoding takes longer than fitting
-FIGURES = 9  # of a dot, that follow from its fit
+FIGURES = 10  # of a dot, that follow from its fit
 SAME_PLACE = 0.6  # radii: two dots closer than this are one
 SPOT_SHARE = 0.3  # of the markers' contrast: what a spot must stand out by
 
@@ -46,7 +46,8 @@ class Dots:
         flattening: ratio of the axes, 1 for a circle, (D).
         contrast: of the dot against its surroundings, negative for dark dots [grey levels], (D).
         leverage: what a grey level of independent noise in every pixel moves the centre by [px], (D, 2).
-        residual: root mean square misfit of the disc, as a share of the contrast, (D).
+        residual: root mean square, as a share of the contrast, (D).
+        misfit: likewise without the pixels' own noise, where that matters, (D).
         used: share of the pixels that the fit trusted, (D).
     """
 
@@ -59,6 +60,7 @@ class Dots:
     contrast: Array
     leverage: Array
     residual: Array
+    misfit: Array
     used: Array
 
     def __len__(self) -> int:
@@ -76,7 +78,8 @@ class Dots:
         """As many dots that are not there."""
         nan = np.full(count, np.nan)
         pair = np.full((count, 2), np.nan)
-        return cls(pair, pair.copy(), np.full((count, PARAMETERS), np.nan), nan, nan, nan, nan, pair.copy(), nan, nan)
+        parameters = np.full((count, PARAMETERS), np.nan)
+        return cls(pair, pair.copy(), parameters, nan, nan, nan, nan, pair.copy(), nan, nan, nan)
 
 
 @njit(cache=True, nogil=True)
@@ -103,11 +106,12 @@ def _fit_some(image, start, first, last, wary, fitted, figures):  # type: ignore
 
 @njit(cache=True, nogil=True)
 def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
-    """Fills what `Dots` says of one fit: sigma (2), leverage (2), radius, flattening, residual, used, vague."""
+    """Fills what `Dots` says of one fit: sigma (2), leverage (2), radius, flattening, residual, used, vague, misfit."""
     figures[0:2] = np.nan
     figures[2], figures[3] = np.sqrt(quality[1]), np.sqrt(quality[2])
     figures[4], figures[5], figures[8] = np.nan, 0.0, np.nan
     figures[6], figures[7] = np.sqrt(quality[5]) / max(abs(p[8]), 1e-12), quality[6]
+    figures[9] = np.sqrt(quality[5] - quality[10]) / max(abs(p[8]), 1e-12)
     determinant = p[2] * p[4] - p[3] * p[3]
     mean = 0.5 * (p[2] + p[4])
     if not (quality[0] > 0.0 and determinant > 0.0 and mean > 0.0):
@@ -145,6 +149,7 @@ def fit_dots(image: NDArray, start: Array, wanted: int | None = None, wary: bool
         contrast=fitted[:, 8],
         leverage=figures[:, 2:4],
         residual=figures[:, 6],
+        misfit=figures[:, 9],
         used=figures[:, 7],
     )
 
@@ -244,7 +249,7 @@ def dots_at(image: NDArray, start: Array, dark: bool) -> Dots:
 
 
 def _are_sound(image: NDArray, dots: Dots, dark: bool) -> NDArray[np.bool_]:
-    good = np.isfinite(dots.sigma[:, 0]) & (dots.flattening > FLATTEST) & (dots.residual < 0.25)
+    good = np.isfinite(dots.sigma[:, 0]) & (dots.flattening > FLATTEST) & (dots.misfit < 0.25)
     largest = dots.radius * (1.0 + 2.0 * np.minimum(dots.vague, VAGUEST))
     good &= (largest > RADII[0] - 1) & (dots.radius < RADII[1] + 1) & (dots.used > 0.5)
     good &= (np.abs(dots.contrast) > LEAST_CONTRAST) & ((dots.contrast < 0) == dark)

@@ -29,12 +29,12 @@ class Family:
 
     def admits(self, dots: Dots) -> NDArray[np.bool_]:
         """Which dots could be markers of this family, (D)."""
-        figures = dots.radius, dots.vague, dots.flattening, dots.contrast, dots.residual, dots.used, dots.sigma
+        figures = dots.radius, dots.vague, dots.flattening, dots.contrast, dots.misfit, dots.used, dots.sigma
         return _admitted(self.radius, self.contrast, *figures)
 
 
 @njit(cache=True)
-def _admitted(usual_radius, usual_contrast, radius, vague, flattening, contrast, residual, used, sigma):  # type: ignore[no-untyped-def]
+def _admitted(usual_radius, usual_contrast, radius, vague, flattening, contrast, misfit, used, sigma):  # type: ignore[no-untyped-def]
     good = np.empty(len(radius), np.bool_)
     for k in range(len(radius)):
         ratio = contrast[k] / usual_contrast
@@ -43,7 +43,7 @@ def _admitted(usual_radius, usual_contrast, radius, vague, flattening, contrast,
             and flattening[k] > 0.45
             and 0.3 < ratio < 3.0
             and abs(contrast[k]) > LEAST_CONTRAST
-            and residual[k] < 0.2
+            and misfit[k] < 0.2
             and used[k] > 0.55
             and sigma[k, 0] < WORST_SIGMA
             and sigma[k, 1] < WORST_SIGMA
@@ -61,8 +61,8 @@ def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
     vague = np.minimum(dots.vague, VAGUEST)
     unlike = np.log(dots.radius / np.median(usual.radius)) ** 2 / (0.12**2 + vague**2)
     unlike += (np.log(dots.contrast / np.median(usual.contrast)) / 0.35) ** 2
-    residual = float(np.median(usual.residual))
-    unlike += (np.maximum(dots.residual - residual, 0.0) / max(0.5 * residual, 0.02)) ** 2
+    misfit = float(np.median(usual.misfit))
+    unlike += (np.maximum(dots.misfit - misfit, 0.0) / np.maximum(max(0.5 * misfit, 0.02), 0.25 * dots.residual)) ** 2
     return unlike < UNLIKE**2
 
 
@@ -72,7 +72,7 @@ def find_family(image: NDArray) -> tuple[Family, Dots] | None:
     for dark in (True, False):
         start = candidates(image, dark)
         dots = dots_at(image, start, dark)
-        dots = dots[(dots.residual < 0.15) & (dots.flattening > 0.5)]
+        dots = dots[(dots.misfit < 0.15) & (dots.flattening > 0.5)]
         # A printed dot is located ten times as well as a blot that happens to be round.
         sigma = dots.sigma.max(axis=1)
         quality = 1.0 / (1.0 + (sigma / SHARP) ** 2) ** 2

@@ -12,6 +12,7 @@ from tracking.disc import (
     RESIDUAL,
     SHOWN,
     SIZE,
+    VALUE,
     WEIGHT,
     J,
     X,
@@ -27,6 +28,8 @@ from tracking.normal_equations import add_products, normal_equations
 
 OUTLYING = 0.12  # of the contrast: a pixel farther off than this shows something else than the dot
 STRANGE = 0.2  # of the contrast: a level this far from what the start expects
+NOISY = 3.5  # standard deviations of the pixels' noise: where that is more, it is not strange yet
+ASKED = 0.1  # of the contrast: a residual up to which it does not matter how much of it is noise
 FEW = 0.01  # of the pixels: so many may look strange by noise
 LITTLE = 0.3  # weight
 BESIDE = 1.2  # standard deviations of the edge: what shows something else is blurred as well
@@ -34,7 +37,7 @@ LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edg
 
 
 @njit(**FAST)
-def _reweight(p, instants, x0, y0, count, strange, w):  # type: ignore[no-untyped-def]
+def _reweight(p, instants, x0, y0, count, strange, share, w):  # type: ignore[no-untyped-def]
     """Less weight to pixels far off, by the median of the residuals' size; returns the largest change.
 
     At the outline by the median there: a dot drawn by hand is nowhere quite a disc. None at all to pixels that show
@@ -43,7 +46,7 @@ def _reweight(p, instants, x0, y0, count, strange, w):  # type: ignore[no-untype
     count = min(count, LARGEST)
     for first in range(0, count, CHUNK):
         linearise(p, instants, x0, y0, first, filled_up(min(CHUNK, count - first)), w)
-        _weigh_levels(first, min(CHUNK, count - first), p[8], w)
+        _weigh_levels(first, min(CHUNK, count - first), p[8], share, w)
     if strange:
         _widen(BESIDE * np.sqrt(0.5 * (p[5] + p[5 if instants > 1 else 7])), count, w)
     else:
@@ -111,7 +114,7 @@ def _fit(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
     instants = 1
     away = 1.0 + 2.0 / np.sqrt(max(p[2] * p[4] - p[3] * p[3], 1e-12))
     left, right, top, bottom = p[0] - away, p[0] + away, p[1] - away, p[1] + away
-    strange = False
+    strange, share = False, STRANGE
     count = 0
     x0 = 0
     y0 = 0
@@ -120,7 +123,7 @@ def _fit(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
         count = choose_pixels(image, p, near, w)
         if count < 3 * n:
             return False
-        strange = _distrust(p, x0, y0, count, wary, w, H)
+        strange, share = _distrust(p, x0, y0, count, wary, w, H)
         if not minimise(p, instants, x0, y0, count, w, H, L, quality):
             return strange
         if not (left < p[0] < right and top < p[1] < bottom):
@@ -139,7 +142,7 @@ def _fit(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
             normal_equations(p, instants, x0, y0, count, w, H)
     if strange or _count_beyond(OUTLYING * abs(p[8]), count, w) > 0:
         for _ in range(6):
-            change = _reweight(p, instants, x0, y0, count, strange, w)
+            change = _reweight(p, instants, x0, y0, count, strange, share, w)
             normal_equations(p, instants, x0, y0, count, w, H)
             if not minimise(p, instants, x0, y0, count, w, H, L, quality):
                 return strange
@@ -147,46 +150,77 @@ def _fit(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
                 break
     if instants > 1:  # back to W, from which another fit may start
         p[5], p[6], p[7] = p[5] + p[6] ** 2 / 12.0, p[6] * p[7] / 12.0, p[5] + p[7] ** 2 / 12.0
+    if quality[5] > (ASKED * p[8]) ** 2:
+        quality[10] = min(_noise(RESIDUAL, count, w) ** 2, quality[5])
     quality[0] = 1.0
     return False
 
 
 @njit(**FAST)
 def _distrust(p, x0, y0, count, wary, w, H):  # type: ignore[no-untyped-def]
-    """First weights: little where a level is far from the start's, at the outline from all between; True if any is.
+    """First weights: little where a level is far from the start's, at the outline from all between; whether any is.
 
-    Otherwise a highlight beside the dot could pass for its blurred edge. Fills H as `normal_equations` does.
+    Otherwise a highlight beside the dot could pass for its blurred edge. Also returns how far is far, as a share of the
+    contrast. Fills H as `normal_equations` does.
     """
-    strange = np.float32(0.0)
+    share = STRANGE
     w[WEIGHT : WEIGHT + count] = np.float32(1.0)
+    strange = _weigh_start(p, x0, y0, count, share, w, H)
+    if wary and strange >= max(4.0, FEW * count):
+        share = max(STRANGE, NOISY * _noise(VALUE, count, w) / abs(p[8]))
+        if share > STRANGE:
+            strange = _weigh_start(p, x0, y0, count, share, w, H)
+    if not wary or strange < max(4.0, FEW * count):
+        return False, share
+    _widen(BESIDE * np.sqrt(0.5 * (p[5] + p[7])), count, w)
+    w[WEIGHT : WEIGHT + count] = w[SHOWN : SHOWN + count]
+    normal_equations(p, 1, x0, y0, count, w, H)
+    return True, share
+
+
+@njit(**FAST)
+def _weigh_start(p, x0, y0, count, share, w, H):  # type: ignore[no-untyped-def]
+    """Weights by the levels that a start expects; returns how many are small. Fills H as `normal_equations` does."""
+    strange = np.float32(0.0)
     H[:] = 0.0
     for first in range(0, count, CHUNK):
         some = filled_up(min(CHUNK, count - first))
         linearise(p, 1, x0, y0, first, some, w)
-        strange += _weigh_levels(first, min(CHUNK, count - first), p[8], w)
+        strange += _weigh_levels(first, min(CHUNK, count - first), p[8], share, w)
         add_products(first, some, w, H)
-    if not wary or strange < max(4.0, FEW * count):
-        return False
-    _widen(BESIDE * np.sqrt(0.5 * (p[5] + p[7])), count, w)
-    w[WEIGHT : WEIGHT + count] = w[SHOWN : SHOWN + count]
-    normal_equations(p, 1, x0, y0, count, w, H)
-    return True
+    return strange
 
 
 @njit(**FAST)
-def _weigh_levels(first, count, contrast, w):  # type: ignore[no-untyped-def]
-    """Fills a linearised chunk's weights by the levels shown, and which are flat; returns how many are small."""
+def _noise(row, count, w):  # type: ignore[no-untyped-def]
+    """The standard deviation of what pixels side by side in a line do not share, by the median of its size."""
+    count = min(count, LARGEST)
+    found = 0
+    for k in range(1, count):
+        beside = (w[Y + k] == w[Y + k - 1]) & (w[X + k] - w[X + k - 1] < np.float32(2.5))
+        w[SIZE + found] = abs(w[row + k] - w[row + k - 1])
+        found += int(beside)
+    return 1.4826 / np.sqrt(2.0) * np.median(w[SIZE : SIZE + max(found, 1)])
+
+
+@njit(**FAST)
+def _weigh_levels(first, count, contrast, share, w):  # type: ignore[no-untyped-def]
+    """Fills a linearised chunk's weights by the levels shown, and which are flat; returns how many are small.
+
+    share: of the contrast: a level this far from what is expected gets half of the weight.
+    """
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
     zero, one = np.float32(0.0), np.float32(1.0)
-    scale = np.float32(1.0 / (STRANGE * abs(contrast)))
-    over = np.float32(1.0 / (STRANGE * contrast))
+    inverse = np.float32(1.0 / share)
+    scale = inverse / np.float32(abs(contrast))
+    over = inverse / np.float32(contrast)
     strange = zero
     for k in range(count):
         step = w[J + 8 * CHUNK + k]
         away = w[J + 12 * CHUNK + k]
-        beyond = away * over - (one - step) * np.float32(1.0 / STRANGE)  # the disc's level
-        short = -away * over - step * np.float32(1.0 / STRANGE)  # its surroundings'
+        beyond = away * over - (one - step) * inverse  # the disc's level
+        short = -away * over - step * inverse  # its surroundings'
         far = abs(step - np.float32(0.5)) > np.float32(0.4999)
         z = away * scale if far else max(max(beyond, short), zero)
         weight = one / (one + z * z * z * z)

@@ -27,6 +27,7 @@ class Drawn:
     radius: float = 6.0
     blur: float = 1.0
     noise: float = 2.0
+    contrast: float = 130.0
 
     def read(self) -> Reading:
         return Reading(self.frames())
@@ -36,7 +37,8 @@ class Drawn:
             shown = places[3:] if frame in self.hidden else places
             blots = self.blots if frame >= 5 else ()
             dots = [(x, y, self.radius, self.radius, 0.0) for x, y in (*shown, *blots) if np.isfinite(x)]
-            yield Frame(0.01 * frame, picture(dots, SIZE, blur=self.blur, noise=self.noise, seed=frame))
+            look = {"blur": self.blur, "noise": self.noise, "contrast": self.contrast}
+            yield Frame(0.01 * frame, picture(dots, SIZE, seed=frame, **look))
 
 
 def grid(columns: int = 8, rows: int = 3) -> np.ndarray:
@@ -64,6 +66,19 @@ def test_small_dots_out_of_focus_are_followed(radius: float, blur: float) -> Non
     found = tracks.pixel[:, order(tracks.start, truth[0])]
     assert np.isfinite(found).mean() > 0.97
     assert np.nanmax(np.linalg.norm(found - truth, axis=2)) < 0.4
+
+
+@pytest.mark.parametrize(("radius", "noise"), [(5.0, 8.0), (8.0, 10.0)])
+def test_dim_dots_in_noise_are_followed(radius: float, noise: float) -> None:
+    """Of a contrast four or five times the pixels' noise, by how much a disc's residual is of no account."""
+    truth = bent(grid(), 20.0 * np.cos(2 * np.pi * np.arange(24) / 7.3))
+    tracks = follow(Drawn(truth, radius=radius, noise=noise, contrast=40.0), lambda: None)  # type: ignore[arg-type]
+    assert tracks.pixel.shape == truth.shape
+    named = order(tracks.start, truth[0])
+    error = tracks.pixel[:, named] - truth
+    assert np.isfinite(error).mean() > 0.98
+    assert np.nanmax(np.abs(error)) < 1.0
+    assert 0.8 < np.sqrt(np.nanmean((error / tracks.sigma[:, named]) ** 2)) < 1.25
 
 
 @pytest.mark.parametrize("swing", [10.0, 20.0, 30.0])
