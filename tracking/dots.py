@@ -26,7 +26,7 @@ SHARED_NOISE = 1.25  # variance by blocks over that by independent errors, beyon
 ENOUGH_FOR_TWO = 64  # dots, to fit half of them in another thread; with fewer, decoding takes longer than fitting
 FIGURES = 10  # of a dot, that follow from its fit
 SAME_PLACE = 0.6  # radii: two dots closer than this are one
-SPOT_SHARE = 0.3  # of the markers' contrast: what a spot must stand out by
+SHADES = 0.2  # of a shade's logarithm: dots that differ by less may be alike, however much light falls on them
 
 
 _POOL = ThreadPoolExecutor(2, thread_name_prefix="dots")
@@ -69,6 +69,11 @@ class Dots:
     def __getitem__(self, rows: NDArray | slice) -> "Dots":
         return Dots(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
+    @property
+    def shade(self) -> Array:
+        """The contrast as a share of the brighter of a dot and its surroundings: the same in any light, (D)."""
+        return shade_of(self.contrast, self.parameters[:, 9])
+
     def beside(self, more: "Dots") -> "Dots":
         """These and more."""
         return Dots(*(np.concatenate([getattr(self, name), getattr(more, name)]) for name in self.__dataclass_fields__))
@@ -80,6 +85,12 @@ class Dots:
         pair = np.full((count, 2), np.nan)
         parameters = np.full((count, PARAMETERS), np.nan)
         return cls(pair, pair.copy(), parameters, nan, nan, nan, nan, pair.copy(), nan, nan, nan)
+
+
+@njit(cache=True)
+def shade_of(contrast, level):  # type: ignore[no-untyped-def]
+    """See `Dots.shade`; of one dot or of several."""
+    return np.abs(contrast) / np.maximum(np.maximum(level, level + contrast), 1.0)
 
 
 @njit(cache=True, nogil=True)
@@ -267,13 +278,13 @@ def apart(dots: Dots, nearest: float) -> Dots:
     return dots[np.array(kept, dtype=int)]
 
 
-def find_spots(image: NDArray, radius: float, contrast: float, region: tuple[int, int, int, int]) -> Array:
-    """Where dots of a known radius and contrast may be, quickly, to half a radius or so, (D, 2).
+def find_spots(image: NDArray, radius: float, least: float, region: tuple[int, int, int, int]) -> Array:
+    """Where dots of a known radius may be, quickly, to half a radius or so, (D, 2).
 
     Args:
         image: grey levels.
         radius: of the dots [px].
-        contrast: negative for dark dots [grey levels].
+        least: what they must stand out by, negative for dark dots [grey levels].
         region: left, top, right, bottom of where to look [px].
     """
     left, top = max(region[0], 0), max(region[1], 0)
@@ -284,13 +295,13 @@ def find_spots(image: NDArray, radius: float, contrast: float, region: tuple[int
         return np.zeros((0, 2))
     part = part[: height * shrink, : width * shrink]
     small = cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA) if shrink > 1 else part
-    signed = small if contrast > 0 else 255 - small
+    signed = small if least > 0 else 255 - small
     inner, outer = (int(factor * radius / shrink) | 1 for factor in (1.3, 4.5))
     level = cv2.boxFilter(signed, cv2.CV_32F, (outer, outer), borderType=cv2.BORDER_REFLECT)
     response = cv2.boxFilter(signed, cv2.CV_32F, (inner, inner), borderType=cv2.BORDER_REFLECT)
     response = cv2.subtract(response, level, dst=response)  # in place: fresh memory takes longer than the sums
     highest = cv2.dilate(response, np.ones((inner, inner)), dst=level)
-    peaks = (highest == response) & (response > SPOT_SHARE * abs(contrast))
+    peaks = (highest == response) & (response > abs(least))
     rows, columns = np.divmod(np.flatnonzero(peaks), width)  # np.nonzero takes ten times as long
     centre = (shrink - 1) / 2.0
     spots = np.stack([columns * shrink + centre + left, rows * shrink + centre + top], axis=1)

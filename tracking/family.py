@@ -6,10 +6,23 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tracking.dots import LEAST_CONTRAST, SAME_PLACE, VAGUEST, Dots, apart, candidates, dots_at, fit_dots
+from tracking.dots import (
+    LEAST_CONTRAST,
+    SAME_PLACE,
+    SHADES,
+    VAGUEST,
+    Dots,
+    apart,
+    candidates,
+    dots_at,
+    fit_dots,
+    shade_of,
+)
 
 SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
+DIM, DIMMEST = 0.3, 0.15  # of the usual contrast; between them a dot must keep back as large a share of the light
+SPOT_SHARE, SPOT_LEAST = 0.3, 0.5  # of the usual and of the dimmest marker's contrast: what a spot must stand out by
 WORST_SIGMA = 0.4  # px: a dot located worse than this is none
 
 
@@ -21,28 +34,43 @@ class Family:
         dark: darker than their surroundings.
         radius: median [px].
         contrast: median [grey levels].
+        shade: median, see `Dots.shade`.
     """
 
     dark: bool
     radius: float
     contrast: float
+    shade: float
+
+    @classmethod
+    def of(cls, dark: bool, dots: Dots) -> "Family":
+        """That of these dots."""
+        return cls(dark, *(float(np.median(figure)) for figure in (dots.radius, dots.contrast, dots.shade)))
+
+    def least(self, dimmest: float) -> float:
+        """What a spot must stand out by, where the dimmest of the markers has this contrast [grey levels]."""
+        return float(np.copysign(min(SPOT_SHARE * abs(self.contrast), SPOT_LEAST * abs(dimmest)), self.contrast))
 
     def admits(self, dots: Dots) -> NDArray[np.bool_]:
         """Which dots could be markers of this family, (D)."""
-        figures = dots.radius, dots.vague, dots.flattening, dots.contrast, dots.misfit, dots.used, dots.sigma
-        return _admitted(self.radius, self.contrast, *figures)
+        figures = dots.radius, dots.vague, dots.flattening, dots.parameters, dots.misfit, dots.used, dots.sigma
+        return _admitted(self.radius, self.contrast, self.shade, *figures)
 
 
 @njit(cache=True)
-def _admitted(usual_radius, usual_contrast, radius, vague, flattening, contrast, misfit, used, sigma):  # type: ignore[no-untyped-def]
+def _admitted(  # type: ignore[no-untyped-def]
+    usual_radius, usual_contrast, usual_shade, radius, vague, flattening, parameters, misfit, used, sigma
+):
     good = np.empty(len(radius), np.bool_)
     for k in range(len(radius)):
-        ratio = contrast[k] / usual_contrast
+        contrast, level = parameters[k, 8], parameters[k, 9]
+        ratio = contrast / usual_contrast
         good[k] = (
             abs(np.log(radius[k] / usual_radius)) < np.log(1.35) + 2.0 * min(vague[k], VAGUEST)
             and flattening[k] > 0.45
-            and 0.3 < ratio < 3.0
-            and abs(contrast[k]) > LEAST_CONTRAST
+            and DIMMEST < ratio < 3.0
+            and (ratio > DIM or abs(np.log(shade_of(contrast, level) / usual_shade)) < SHADES)
+            and abs(contrast) > LEAST_CONTRAST
             and misfit[k] < 0.2
             and used[k] > 0.55
             and sigma[k, 0] < WORST_SIGMA
@@ -60,7 +88,9 @@ def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
     """Which are like the usual in size, contrast and fit taken together: a blot is a little off in all."""
     vague = np.minimum(dots.vague, VAGUEST)
     unlike = np.log(dots.radius / np.median(usual.radius)) ** 2 / (0.12**2 + vague**2)
-    unlike += (np.log(dots.contrast / np.median(usual.contrast)) / 0.35) ** 2
+    contrast, shade = np.log(dots.contrast / np.median(usual.contrast)), np.log(dots.shade / np.median(usual.shade))
+    # Where less light falls on a dot, it differs more, and keeps back as large a share.
+    unlike += np.minimum((contrast / 0.35) ** 2, (contrast / 0.7) ** 2 + (shade / 0.1) ** 2)
     misfit = float(np.median(usual.misfit))
     unlike += (np.maximum(dots.misfit - misfit, 0.0) / np.maximum(max(0.5 * misfit, 0.02), 0.25 * dots.residual)) ** 2
     return unlike < UNLIKE**2
@@ -84,8 +114,7 @@ def find_family(image: NDArray) -> tuple[Family, Dots] | None:
             if best is None or score > best[0]:
                 members = dots[alike & _are_located(dots, dots[alike])]
                 members = members[_are_kin(members, members)]
-                family = Family(dark, float(np.median(members.radius)), float(np.median(members.contrast)))
-                best = (score, family, members, start)
+                best = (score, Family.of(dark, members), members, start)
     return None if best is None else (best[1], _with_relatives(image, *best[1:]))
 
 

@@ -30,6 +30,7 @@ OUTLYING = 0.12  # of the contrast: a pixel farther off than this shows somethin
 STRANGE = 0.2  # of the contrast: a level this far from what the start expects
 NOISY = 3.5  # standard deviations of the pixels' noise: where that is more, it is not strange yet
 ASKED = 0.1  # of the contrast: a residual up to which it does not matter how much of it is noise
+LIT, EXPLAINED = 0.05, 0.5  # of the light's logarithm: a change that matters; of what is strange: what is left of it
 FEW = 0.01  # of the pixels: so many may look strange by noise
 LITTLE = 0.3  # weight
 BESIDE = 1.2  # standard deviations of the edge: what shows something else is blurred as well
@@ -167,6 +168,8 @@ def _distrust(p, x0, y0, count, wary, w, H):  # type: ignore[no-untyped-def]
     w[WEIGHT : WEIGHT + count] = np.float32(1.0)
     strange = _weigh_start(p, x0, y0, count, share, w, H)
     if wary and strange >= max(4.0, FEW * count):
+        strange = _relight(p, x0, y0, count, strange, w, H)
+    if wary and strange >= max(4.0, FEW * count):
         share = max(STRANGE, NOISY * _noise(VALUE, count, w) / abs(p[8]))
         if share > STRANGE:
             strange = _weigh_start(p, x0, y0, count, share, w, H)
@@ -176,6 +179,30 @@ def _distrust(p, x0, y0, count, wary, w, H):  # type: ignore[no-untyped-def]
     w[WEIGHT : WEIGHT + count] = w[SHOWN : SHOWN + count]
     normal_equations(p, 1, x0, y0, count, w, H)
     return True, share
+
+
+@njit(**FAST)
+def _relight(p, x0, y0, count, strange, w, H):  # type: ignore[no-untyped-def]
+    """Gives a start the light of the picture, where that explains most of what is strange; returns how much is left.
+
+    Light brightens a dot and its surroundings by the same factor; what shows something else than the dot does not.
+    """
+    contrast, level = p[8], p[9]
+    least = np.float32(max(level, level + contrast) - 0.25 * abs(contrast))
+    bright = 0
+    for k in range(min(count, LARGEST)):
+        expected = w[VALUE + k] - w[RESIDUAL + k]
+        w[SIZE + bright] = w[VALUE + k] / max(expected, np.float32(1.0))
+        bright += int((w[FLAT + k] > np.float32(0.0)) & (expected > least))
+    light = np.median(w[SIZE : SIZE + max(bright, 1)])
+    if bright == 0 or abs(np.log(max(light, 0.01))) < LIT:
+        return strange
+    p[8], p[9] = contrast * light, level * light
+    left = _weigh_start(p, x0, y0, count, STRANGE, w, H)
+    if left < EXPLAINED * strange:
+        return left
+    p[8], p[9] = contrast, level
+    return _weigh_start(p, x0, y0, count, STRANGE, w, H)
 
 
 @njit(**FAST)

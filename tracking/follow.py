@@ -15,7 +15,7 @@ from groundwork import InputError
 from tracking.affine import carry
 from tracking.cut import WholeLooks
 from tracking.disc import PARAMETERS
-from tracking.dots import SAME_PLACE, Dots, apart, eight_bits, find_spots, fit_dots, start_of
+from tracking.dots import SAME_PLACE, SHADES, Dots, apart, eight_bits, find_spots, fit_dots, shade_of, start_of
 from tracking.family import Family, find_family
 from tracking.frame import Frame
 from tracking.memory import Memory
@@ -256,8 +256,8 @@ class Tracker:
         start[:, :2] = expected
         dots = fit_dots(image, start)
         good = self.family.admits(dots)
-        before, same = self.parameters[:, 8], SAME_PLACE * self.family.radius
-        calm = _own(dots.centre, dots.contrast, expected, before, self.missing, self.pattern.spacing, same, good)
+        same = SAME_PLACE * self.family.radius
+        calm = _own(dots.parameters, self.parameters, expected, self.missing, self.pattern.spacing, same, good)
         return _only(dots, good) if calm else None
 
     def _search(self, image: NDArray, expected: Array) -> Dots:
@@ -269,9 +269,9 @@ class Tracker:
         low, high = expected.min(0) - margin, expected.max(0) + margin
         shape = np.median(self.parameters[:, 2:5], axis=0)
         level = float(np.median(self.parameters[:, 9]))
-        spots = find_spots(
-            image, self.family.radius, self.family.contrast, (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-        )
+        region = int(low[0]), int(low[1]), int(high[0]), int(high[1])
+        least = self.family.least(float(np.nanmin(np.abs(self.parameters[:, 8]))))
+        spots = find_spots(image, self.family.radius, least, region)
         starts = [start_of(x, y, shape, self.family.contrast, level) for x, y in spots]
         dots = fit_dots(image, np.array(starts).reshape(-1, PARAMETERS))
         dots = apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
@@ -322,17 +322,21 @@ class Tracker:
 
 
 @njit(cache=True)
-def _own(centre, contrast, expected, before, missing, spacing, same, good):  # type: ignore[no-untyped-def]
+def _own(parameters, before, expected, missing, spacing, same, good):  # type: ignore[no-untyped-def]
     """Leaves in good (M) the markers whose own dots these are; False where too few lie near their expected places.
 
-    before: contrast in the picture before. same: distance below which two dots are one.
+    before: parameters in the picture before. same: distance below which two dots are one.
     """
     count = len(good)
+    centre = parameters[:, :2]
     seen = near = 0
     for k in range(count):
         away = np.hypot(centre[k, 0] - expected[k, 0], centre[k, 1] - expected[k, 1]) / spacing[k]
-        change = contrast[k] / before[k]
-        good[k] = good[k] and away < STRAY and 0.5 < change < 2.0
+        change = parameters[k, 8] / before[k, 8]
+        if good[k] and not 0.5 < change < 2.0:  # in changing light only by as much as its surroundings' level
+            shade, earlier = shade_of(parameters[k, 8], parameters[k, 9]), shade_of(before[k, 8], before[k, 9])
+            good[k] = change > 0.0 and abs(np.log(shade / earlier)) < SHADES
+        good[k] = good[k] and away < STRAY
         if good[k] and missing[k] == 0:
             seen += 1
             near += away < CALM

@@ -15,7 +15,7 @@ from tracking.affine import carry
 from tracking.cut import doubted
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, find_spots, fit_dots, start_of
-from tracking.family import Family
+from tracking.family import DIM, Family
 from tracking.shape import NEIGHBOURS, Pattern
 
 Array = NDArray[Any]
@@ -105,7 +105,7 @@ class Newcomers:
         spacing = float(np.median(pattern.spacing))
         low, high = place.min(0) - FAR * spacing, place.max(0) + FAR * spacing
         region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-        spots = find_spots(image, self.family.radius, self.family.contrast, region)
+        spots = find_spots(image, self.family.radius, self.family.least(self.family.contrast), region)
         away = np.linalg.norm(spots[:, None] - place[None], axis=2).min(axis=1, initial=np.inf)
         strange = spots[away > 0.5 * FREE * spacing]
         if not len(strange):
@@ -115,7 +115,8 @@ class Newcomers:
         return apart(dots[self._admitted(dots)], SAME_PLACE * self.family.radius).centre
 
     def _admitted(self, dots: Dots) -> NDArray[np.bool_]:
-        return self.family.admits(dots) & (np.abs(np.log(dots.radius / self.family.radius)) < np.log(ALIKE))
+        good = self.family.admits(dots) & (dots.contrast / self.family.contrast > DIM)
+        return good & (np.abs(np.log(dots.radius / self.family.radius)) < np.log(ALIKE))
 
     def _count(self, found: Array, rest: Array, number: int, same: float) -> None:
         """Candidates that this look does not show are given up; what it shows for the first time becomes one."""

@@ -1,4 +1,4 @@
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -28,6 +28,7 @@ class Drawn:
     blur: float = 1.0
     noise: float = 2.0
     contrast: float = 130.0
+    light: Callable[[int], np.ndarray] = lambda _: np.ones(SIZE[0])  # by column
 
     def read(self) -> Reading:
         return Reading(self.frames())
@@ -38,7 +39,8 @@ class Drawn:
             blots = self.blots if frame >= 5 else ()
             dots = [(x, y, self.radius, self.radius, 0.0) for x, y in (*shown, *blots) if np.isfinite(x)]
             look = {"blur": self.blur, "noise": self.noise, "contrast": self.contrast}
-            yield Frame(0.01 * frame, picture(dots, SIZE, seed=frame, **look))
+            lit = picture(dots, SIZE, seed=frame, **look) * self.light(frame)
+            yield Frame(0.01 * frame, np.clip(np.rint(lit), 0, 255).astype(np.uint8))
 
 
 def grid(columns: int = 8, rows: int = 3) -> np.ndarray:
@@ -79,6 +81,25 @@ def test_dim_dots_in_noise_are_followed(radius: float, noise: float) -> None:
     assert np.isfinite(error).mean() > 0.98
     assert np.nanmax(np.abs(error)) < 1.0
     assert 0.8 < np.sqrt(np.nanmean((error / tracks.sigma[:, named]) ** 2)) < 1.25
+
+
+def shadow(frame: int) -> np.ndarray:
+    """Comes in from the left and leaves a quarter of the light."""
+    return 1.0 / (1.0 + 3.0 / (1.0 + np.exp(np.clip((np.arange(SIZE[0]) - 20.0 * frame) / 15.0, -30, 30))))
+
+
+def flicker(frame: int) -> np.ndarray:
+    return np.full(SIZE[0], 0.8 + 0.35 * np.sin(2.1 * frame))
+
+
+@pytest.mark.parametrize("light", [shadow, flicker])
+def test_dots_are_followed_in_changing_light(light: Callable[[int], np.ndarray]) -> None:
+    truth = bent(grid(), 20.0 * np.cos(2 * np.pi * np.arange(24) / 7.3))
+    tracks = follow(Drawn(truth, light=light), lambda: None)  # type: ignore[arg-type]
+    assert tracks.pixel.shape == truth.shape
+    found = tracks.pixel[:, order(tracks.start, truth[0])]
+    assert np.isfinite(found).all()
+    assert np.max(np.linalg.norm(found - truth, axis=2)) < 0.3
 
 
 @pytest.mark.parametrize("swing", [10.0, 20.0, 30.0])
