@@ -22,6 +22,7 @@ from tracking.dots import (
 SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
 DIM, DIMMEST = 0.3, 0.15  # of the usual contrast; between them a dot must keep back as large a share of the light
+BLACKEST = 1.25  # shade: a dot that seems to keep back more than all light is none
 SPOT_SHARE, SPOT_LEAST = 0.3, 0.5  # of the usual and of the dimmest marker's contrast: what a spot must stand out by
 WORST_SIGMA = 0.4  # px: a dot located worse than this is none
 
@@ -93,7 +94,7 @@ def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
     unlike += np.minimum((contrast / 0.35) ** 2, (contrast / 0.7) ** 2 + (shade / 0.1) ** 2)
     misfit = float(np.median(usual.misfit))
     unlike += (np.maximum(dots.misfit - misfit, 0.0) / np.maximum(max(0.5 * misfit, 0.02), 0.25 * dots.residual)) ** 2
-    return unlike < UNLIKE**2
+    return (unlike < UNLIKE**2) & (dots.shade < BLACKEST + 2.0 * vague)
 
 
 def find_family(image: NDArray) -> tuple[Family, Dots] | None:
