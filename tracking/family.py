@@ -80,9 +80,16 @@ def _admitted(  # type: ignore[no-untyped-def]
     return good
 
 
+def _quality(dots: Dots) -> NDArray:
+    """How much each counts, (D): a printed dot is located ten times as well as a blot that happens to be round."""
+    return 1.0 / (1.0 + (dots.sigma.max(axis=1) / SHARP) ** 2) ** 2
+
+
 def _are_located(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
-    """Which are located about as well as the usual."""
-    return dots.sigma.max(axis=1) < max(5.0 * float(np.median(usual.sigma.max(axis=1))), 0.05)
+    """Which are located about as well as the usual; among these blots may be the more, and count the less."""
+    sigma = np.sort(usual.sigma.max(axis=1))
+    counted = np.cumsum(np.sort(_quality(usual))[::-1])
+    return dots.sigma.max(axis=1) < max(5.0 * float(sigma[np.searchsorted(counted, 0.5 * counted[-1])]), 0.05)
 
 
 def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
@@ -92,8 +99,10 @@ def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
     contrast, shade = np.log(dots.contrast / np.median(usual.contrast)), np.log(dots.shade / np.median(usual.shade))
     # Where less light falls on a dot, it differs more, and keeps back as large a share.
     unlike += np.minimum((contrast / 0.35) ** 2, (contrast / 0.7) ** 2 + (shade / 0.1) ** 2)
-    misfit = float(np.median(usual.misfit))
-    unlike += (np.maximum(dots.misfit - misfit, 0.0) / np.maximum(max(0.5 * misfit, 0.02), 0.25 * dots.residual)) ** 2
+    # Where the light is dim there is more noise, and of little noise nobody asks how much it is.
+    misfit, residual = float(np.median(usual.misfit)), float(np.median(usual.residual))
+    beyond = np.maximum(np.minimum(dots.misfit - misfit, dots.residual - residual), 0.0)
+    unlike += (beyond / np.maximum(max(0.5 * misfit, 0.02), 0.25 * dots.residual)) ** 2
     return (unlike < UNLIKE**2) & (dots.shade < BLACKEST + 2.0 * vague)
 
 
@@ -104,9 +113,7 @@ def find_family(image: NDArray) -> tuple[Family, Dots] | None:
         start = candidates(image, dark)
         dots = dots_at(image, start, dark)
         dots = dots[(dots.misfit < 0.15) & (dots.flattening > 0.5)]
-        # A printed dot is located ten times as well as a blot that happens to be round.
-        sigma = dots.sigma.max(axis=1)
-        quality = 1.0 / (1.0 + (sigma / SHARP) ** 2) ** 2
+        quality = _quality(dots)
         for seed in range(len(dots)):
             vague = np.minimum(dots.vague + dots.vague[seed], VAGUEST)
             alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2) + 2.0 * vague
