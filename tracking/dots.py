@@ -10,7 +10,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from tracking.disc import PARAMETERS, SCRATCH
+from tracking.disc import LEAST_BLUR, PARAMETERS, SCRATCH
 from tracking.fit import fit_disc
 from tracking.minimise import QUALITY
 
@@ -73,6 +73,12 @@ class Dots:
     def shade(self) -> Array:
         """The contrast as a share of the brighter of a dot and its surroundings: the same in any light, (D)."""
         return shade_of(self.contrast, self.parameters[:, 9])
+
+    @property
+    def blur(self) -> Array:
+        """Standard deviation of the edge where it is sharpest, so without smear [px], (D)."""
+        xx, xy, yy = self.parameters[:, 5:8].T
+        return np.sqrt(np.maximum(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy), LEAST_BLUR))
 
     def beside(self, more: "Dots") -> "Dots":
         """These and more."""

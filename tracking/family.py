@@ -85,24 +85,29 @@ def _quality(dots: Dots) -> NDArray:
     return 1.0 / (1.0 + (dots.sigma.max(axis=1) / SHARP) ** 2) ** 2
 
 
-def _are_located(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
-    """Which are located about as well as the usual; among these blots may be the more, and count the less."""
-    sigma = np.sort(usual.sigma.max(axis=1))
-    counted = np.cumsum(np.sort(_quality(usual))[::-1])
-    return dots.sigma.max(axis=1) < max(5.0 * float(sigma[np.searchsorted(counted, 0.5 * counted[-1])]), 0.05)
+def _usual(figure: NDArray, quality: NDArray) -> float:
+    """The median: of round blots there may be more than of markers, but they count less."""
+    order = np.argsort(figure)
+    counted = np.cumsum(quality[order])
+    return float(figure[order[np.searchsorted(counted, 0.5 * counted[-1])]])
 
 
 def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
-    """Which are like the usual in size, contrast and fit taken together: a blot is a little off in all."""
-    vague = np.minimum(dots.vague, VAGUEST)
-    unlike = np.log(dots.radius / np.median(usual.radius)) ** 2 / (0.12**2 + vague**2)
-    contrast, shade = np.log(dots.contrast / np.median(usual.contrast)), np.log(dots.shade / np.median(usual.shade))
+    """Which are like the usual in size, contrast, fit, sigma and blur taken together: a blot is a little off in all."""
+    quality, vague = _quality(usual), np.minimum(dots.vague, VAGUEST)
+    unlike = np.log(dots.radius / _usual(usual.radius, quality)) ** 2 / (0.12**2 + vague**2)
+    contrast = np.log(dots.contrast / _usual(usual.contrast, quality))
+    shade = np.log(dots.shade / _usual(usual.shade, quality))
     # Where less light falls on a dot, it differs more, and keeps back as large a share.
     unlike += np.minimum((contrast / 0.35) ** 2, (contrast / 0.7) ** 2 + (shade / 0.1) ** 2)
     # Where the light is dim there is more noise, and of little noise nobody asks how much it is.
-    misfit, residual = float(np.median(usual.misfit)), float(np.median(usual.residual))
+    misfit, residual = _usual(usual.misfit, quality), _usual(usual.residual, quality)
     beyond = np.maximum(np.minimum(dots.misfit - misfit, dots.residual - residual), 0.0)
     unlike += (beyond / np.maximum(max(0.5 * misfit, 0.02), 0.25 * dots.residual)) ** 2
+    # A stain has no edge to locate it by; but a marker may be under a glint or farther out of focus than the others.
+    sigma, blur = _usual(usual.sigma.max(axis=1), quality), _usual(usual.blur, quality)
+    unlike += np.maximum(np.log(dots.sigma.max(axis=1) / max(sigma, 0.01)) / 0.55, 0.0) ** 2
+    unlike += np.maximum(np.log(dots.blur / max(blur, 0.5)) / 0.45, 0.0) ** 2
     return (unlike < UNLIKE**2) & (dots.shade < BLACKEST + 2.0 * vague)
 
 
@@ -120,7 +125,7 @@ def find_family(image: NDArray) -> tuple[Family, Dots] | None:
             alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)
             score = float(quality[alike].sum())
             if best is None or score > best[0]:
-                members = dots[alike & _are_located(dots, dots[alike])]
+                members = dots[alike]
                 members = members[_are_kin(members, members)]
                 best = (score, Family.of(dark, members), members, start)
     return None if best is None else (best[1], _with_relatives(image, *best[1:]))
@@ -134,5 +139,5 @@ def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArra
     anew = fit_dots(image, np.concatenate([members.parameters, left]))
     first, more = anew[: len(members)], anew[len(members) :]
     good, more = family.admits(first), more[family.admits(more)]
-    more = more[_are_kin(more, members) & _are_located(more, members)]
+    more = more[_are_kin(more, members)]
     return apart(first[good].beside(members[~good]).beside(more), SAME_PLACE * family.radius)

@@ -220,6 +220,22 @@ def test_the_family_is_not_the_background() -> None:
     assert distance.min(axis=1).max() < 0.2
 
 
+def test_stains_of_the_skin_are_no_markers() -> None:
+    """Dim dots on a skin so mottled that it shows more round stains than there are dots."""
+    dots = 100 + grid()
+    false = 0
+    for seed in range(6):
+        random = np.random.default_rng(seed)
+        skin = picture([(x, y, 6.0, 6.0, 0.0) for x, y in dots], (640, 480), noise=2.0, seed=seed, contrast=60.0)
+        mottled = skin + cv2.resize(random.normal(0.0, 6.0, (62, 82)), (640, 480), interpolation=cv2.INTER_CUBIC)
+        found = find_family(np.clip(np.rint(mottled), 0, 255).astype(np.uint8))
+        assert found is not None
+        away = np.linalg.norm(found[1].centre[:, None] - dots, axis=2)
+        assert away.min(axis=0).max() < 0.5
+        false += len(found[1]) - 24
+    assert false <= 4
+
+
 def test_too_few_dots_are_refused() -> None:
     with pytest.raises(InputError, match=r"drawn\.mp4: expected at least 3 dots .* found 2"):
         follow(Drawn(grid(2, 1)[None]), lambda: None)  # type: ignore[arg-type]
