@@ -26,7 +26,9 @@ SHARED, WAITING, SLOW = 0.009, 3.0, 5.0
 # So many times the variance of these errors may still be error, not the body's own motion; and so many times the errors
 # themselves may, together, pass for a mode of it.
 EXCESS, PASSING = 2.0, 2.0
+# By whose motion places are mended; and errors told, if it has no more modes than may be taken off.
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
+FEW_FRAMES, FEW_MARKERS = 12, 4
 MODES = 12  # of the body's motion, at most
 SPARE = 8  # further ones, of which those of the other markers may need a little
 VANISHED = 1e-6  # share of a mode's square that others than one marker have: it is that marker's alone
@@ -53,8 +55,11 @@ def places_and_errors(pixel: Array, fitted: Array, leverage: Array, step: Array)
     others = Others.of(pixel, np.maximum(fitted, PASSING * coding))
     if others is None:
         return pixel, expected
+    whole = with_shared_errors(expected, others)
+    if not others.are_many:
+        return pixel, whole
     off, mended = mendable(pixel, fitted, coding, others, coarseness(fitted, leverage, step))
-    return pixel - off, np.where(np.isnan(mended), with_shared_errors(expected, others), mended)
+    return pixel - off, np.where(np.isnan(mended), whole, mended)
 
 
 def coding_errors(pixel: Array, fitted: Array, leverage: Array, step: Array) -> Array:
@@ -107,11 +112,11 @@ class Others:
 
     @classmethod
     def of(cls, pixel: Array, sigma: Array) -> "Others | None":
-        """Of paths and their standard deviations [px], (T, D, 2); None where too few frames or markers tell."""
+        """Of paths and their standard deviations [px], (T, D, 2); None where too few tell the motion."""
         seen = np.isfinite(sigma[..., 0])
         markers = np.flatnonzero(seen.mean(axis=0) > 0.8)
         frames = np.flatnonzero(seen[:, markers].all(axis=1)) if len(markers) else np.zeros(0, int)
-        if len(frames) < FEWEST_FRAMES or len(markers) < FEWEST_MARKERS:
+        if len(frames) < FEW_FRAMES or len(markers) < FEW_MARKERS:
             return None
         path = pixel[np.ix_(frames, markers)]
         path = (path - path.mean(axis=0)).reshape(len(frames), -1)
@@ -119,6 +124,8 @@ class Others:
         noise = (sigma[np.ix_(frames, markers)] ** 2).mean(axis=(0, 2))
         most = min(MODES, len(frames) // 4, len(markers) // 2)
         square, modes = np.linalg.eigh(product)  # ascending
+        if (len(frames) < FEWEST_FRAMES or len(markers) < FEWEST_MARKERS) and _count_modes(square, len(frames)) > most:
+            return None
         square, modes = square[-most - SPARE :], modes[:, -most - SPARE :]
         squares, mixes = _without_one(square, modes, product)
         amounts = path @ modes
@@ -139,9 +146,24 @@ class Others:
         return cls(frames, markers, away, leverage, carried)
 
     @property
+    def are_many(self) -> bool:
+        """Whether places may be mended by them."""
+        return len(self.frames) >= FEWEST_FRAMES and len(self.markers) >= FEWEST_MARKERS
+
+    @property
     def missed(self) -> Array:
         """Mean square of what the others' motion leaves of each path, as if it had not been fitted [px^2], (M, 2)."""
         return (self.away**2 * (1.0 - self.leverage[..., None])).mean(axis=0)
+
+
+def _count_modes(square: Array, frames: int) -> int:
+    """How many modes of these squares (ascending, (2 M)) stand out, if half of them are noise.
+
+    Squares of noise have Marchenko and Pastur's distribution, whose median is nearly 1 - 0.35 times the matrix's ratio.
+    """
+    long, short = max(frames - 1, len(square)), min(frames - 1, len(square))
+    noise = float(np.median(square[-short:])) / (long - 0.35 * short)
+    return int((square > 1.1 * noise * (np.sqrt(long) + np.sqrt(short)) ** 2).sum())
 
 
 def _without_one(square: Array, modes: Array, product: Array) -> tuple[Array, Array]:

@@ -118,10 +118,22 @@ def test_frames_in_which_some_are_hidden_keep_their_places(random: np.random.Gen
     assert (sigma[50:60, 5] > sigma[60, 5]).all()
 
 
-def test_few_frames_say_nothing(random: np.random.Generator) -> None:
-    pixel = paths(random, np.full(20, 0.1))[:20]
+def test_of_few_frames_errors_are_told_but_no_place_is_mended(random: np.random.Generator) -> None:
+    pixel = paths(random, np.full(20, 0.06))[:30]
+    place, _ = coded(pixel, 0.06)
+    np.testing.assert_array_equal(place, pixel)
+    assert with_others(pixel, np.full(pixel.shape, 0.02)).mean() == pytest.approx(0.06, rel=0.15)
+
+
+@pytest.mark.parametrize(("frames", "markers"), [(100, 6), (16, 20), (60, 7)])
+def test_motion_in_more_modes_than_can_be_told_apart_is_no_error(
+    random: np.random.Generator, frames: int, markers: int
+) -> None:
+    time = np.arange(frames)
+    amounts = np.stack([np.sin(rate * time) for rate in (0.2, 0.31, 0.43, 0.57, 0.7)])
+    pixel = np.einsum("kt,kdi->tdi", amounts, 5.0 * random.normal(size=(5, markers, 2)))
+    pixel += random.normal(size=pixel.shape) * 0.02
     assert Others.of(pixel, np.full(pixel.shape, 0.02)) is None
-    np.testing.assert_array_equal(coded(pixel, 0.1)[0], pixel)
 
 
 @pytest.mark.parametrize(
