@@ -2,10 +2,11 @@
 
 from dataclasses import dataclass
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 
-MACROBLOCK = 16  # px: side of the squares that H.264 codes with one step
+MACROBLOCK = 16  # px: side of the squares that H.264 and MPEG-4 code with one step
 
 
 @dataclass(frozen=True)
@@ -16,8 +17,9 @@ class Frame:
         time: since the first frame [s]; NaN where unknown.
         picture: grey levels of 0 to 255 (H, W), uint8, or float32 where the video has more than 8 bits;
             None where the frame is damaged.
-        steps: by which H.264 rounded the changes in each square of 16 px [grey levels], (H / 16, W / 16), larger where
-            the encoder says that it was in a hurry; None in most frames, and where the decoder does not say.
+        steps: by which H.264 rounded the changes in each square of 16 px [grey levels], (H / 16, W / 16), or by which
+            it would do a dot as much harm as the video's codec did, (1, 1) where that is said of whole pictures; larger
+            where the encoder says that it was in a hurry; None in most frames, and where nothing is said.
     """
 
     time: float
@@ -40,3 +42,8 @@ class Frame:
 def scaled(levels: NDArray, bits: int) -> NDArray[np.float32]:
     """Grey levels of more than 8 bits as those of 0 to 255."""
     return levels.astype(np.float32) * np.float32(0.5 ** (bits - 8))
+
+
+def quarter_turns(frame: "av.VideoFrame") -> int:
+    """How many quarter turns anticlockwise a frame asks to be shown by."""
+    return round(frame.rotation / 90.0) % 4

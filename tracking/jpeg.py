@@ -13,7 +13,8 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from tracking.ffmpeg import FFmpegDecoder, Outcome, grey, packets_of, quarter_turns
+from tracking.ffmpeg import FFmpegDecoder, Outcome, grey, packets_of
+from tracking.frame import quarter_turns
 from tracking.order import Decoded
 
 PROBED = 5  # first packets or files, of which one may be refused

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from groundwork import InputError
 from tracking.ahead import ahead
 from tracking.decoding import frames_of_file
-from tracking.ffmpeg import quarter_turns
-from tracking.frame import Frame, scaled
+from tracking.frame import Frame, quarter_turns, scaled
 from tracking.jpeg import PROBED, is_whole
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg", ".mpeg", ".ts"}

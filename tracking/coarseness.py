@@ -1,0 +1,176 @@
+"""How coarsely the pictures of a video were coded, as their decoder or their headers tell.
+
+All in steps of H.264 that do a dot as much harm, for which `tracking.noise` was measured.
+"""
+
+import re
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import av
+import numpy as np
+from av.sidedata.sidedata import Type as SideData
+from numpy.typing import NDArray
+
+from tracking.frame import MACROBLOCK, quarter_turns
+
+# Steps of H.264 and HEVC, by quantiser from -64, and of AV1 and VP9, by index: doubling every six, and between knots.
+STEPS = 0.625 * 2.0 ** (np.arange(-64, 128) / 6.0)
+KNOTS, AT_KNOTS = [0, 1, 95, 120, 137, 150, 200, 255], [4, 8, 102, 152, 203, 255, 639, 1828]
+INDEXED = np.interp(np.arange(256), KNOTS, AT_KNOTS) / 8.0
+# FFmpeg's numbers for the kinds of parameters that its decoders export.
+VP9, H264, MPEG = 0, 1, 2
+# A step of theirs does the harm of so many of H.264's times a power of it. Measured on eight to twelve films each, like
+# those for H.264: x265 at crf 16 to 28, SVT-AV1 at 18 to 42, libvpx at 20 to 42, FFmpeg's MPEG-4 at 2 to 8.
+HARM = {"hevc": (0.075, 1.63), "av1": (5.2, 0.4), "vp9": (0.64, 0.85), "mpeg4": (1.35, 1.08)}
+# What x264 and x265 say of themselves, and how much coarser their pictures are than their steps alone would make them
+# where they searched no more thoroughly than that (their `subme`). Measured on seven and four presets at crf 23: in a
+# hurry they let everything lag.
+SEARCHED = re.compile(rb"x26([45]) [(-].{,1500}? subme=(\d{1,2}) ", re.DOTALL)
+COARSER = {b"4": ((2, 2.4), (6, 1.4)), b"5": ((0, 2.3), (1, 1.4))}
+# Frames of which one is asked how it was coded, and fewer once so many have passed; kinds of frames come in fours and
+# twelves. Each answer takes as long as a third of a frame.
+ASKED, LATER, MANY = 7, 59, 70
+FIELDS = re.compile(r"\b(\w+_parameter_set_id|init_qp_minus26|slice_qp_delta|base_q_idx) .*= (-?\d+)\s*$")
+
+
+@dataclass
+class ByDecoder:
+    """What decoders export of the blocks that they decode.
+
+    Attributes:
+        costly: the frames that are asked hold on to their memory.
+        coarser: how much coarser a video is coded than by its steps alone; 0 where that is not known yet.
+    """
+
+    costly: ClassVar[bool] = True
+    coarser: float = 0.0
+
+    def look(self, packet: "av.packet.Packet") -> None:
+        """At the next packet, before its frames."""
+        if not self.coarser:
+            self.coarser = _coarser(bytes(packet))
+
+    def tells_of(self, number: int) -> bool:
+        """Whether to ask for a frame's steps."""
+        return number % (ASKED if number < MANY else LATER) == 0
+
+    def steps(self, frame: "av.VideoFrame") -> NDArray | None:
+        """Of a frame of 8 bits, (1, 1) or as it is to be shown in squares of 16 px."""
+        if frame.format.components[0].bits != 8:
+            return None
+        rows, columns = (-(-side // MACROBLOCK) for side in (frame.height, frame.width))
+        for data in frame.side_data:
+            if data.type != SideData.VIDEO_ENC_PARAMS:
+                continue
+            # FFmpeg's AVVideoEncParams: count, offset and size of the blocks, kind, quantiser; each block ends in its
+            # own.
+            head = np.frombuffer(data, np.int32, 8)
+            count, offset, size, kind, quantiser = (int(head[k]) for k in (0, 2, 4, 6, 7))
+            if kind == VP9:
+                return _harm("vp9", np.full((1, 1), INDEXED[min(max(quantiser, 0), 255)]))
+            if kind not in (H264, MPEG) or count != rows * columns or size % 4:
+                continue
+            blocks = np.frombuffer(data, np.int32, count * size // 4, offset).reshape(rows, columns, -1)[..., 4]
+            if kind == H264:
+                steps = self.coarser * np.take(STEPS, blocks + (quantiser + 64), mode="clip")
+            else:
+                steps = _harm("mpeg4", np.maximum(blocks + quantiser, 1).astype(float))
+            return _turned(steps, frame)
+        return None
+
+
+@dataclass
+class ByHeaders:
+    """What the headers of each packet's pictures say, as FFmpeg spells them out in its log.
+
+    Attributes:
+        costly: see `ByDecoder`.
+        codec: HEVC or AV1, by FFmpeg's name.
+        coarser: see `ByDecoder`.
+        speller: reads headers.
+        usual: quantisers of HEVC, by their parameters' number.
+        step: of the last packet that said.
+    """
+
+    costly: ClassVar[bool] = False
+    codec: str
+    coarser: float
+    speller: "av.bitstream.BitStreamFilterContext"
+    usual: dict[int, int] = field(default_factory=dict)
+    step: float = np.nan
+
+    @classmethod
+    def of(cls, stream: "av.video.stream.VideoStream", codec: str) -> "ByHeaders":
+        """Of a stream that has not been read yet."""
+        with av.logging.Capture(local=True) as said:
+            coarser = _coarser(stream.codec_context.extradata or b"")
+            coarseness = cls(codec, coarser, av.bitstream.BitStreamFilterContext("trace_headers", stream))
+        coarseness._read(said)
+        return coarseness
+
+    def look(self, packet: "av.packet.Packet") -> None:
+        """At the next packet, before its frames."""
+        with av.logging.Capture(local=True) as said:
+            try:
+                self.speller.filter(av.Packet(bytes(packet)))
+            except av.FFmpegError:
+                return
+        self._read(said)
+
+    def tells_of(self, number: int) -> bool:
+        """Whether to ask for a frame's steps."""
+        return number >= 0 and bool(np.isfinite(self.step))
+
+    def steps(self, frame: "av.VideoFrame") -> NDArray:
+        """Of a frame of the last packet, (1, 1)."""
+        return self.coarser * _harm(self.codec, np.full((1, 1), self.step))
+
+    def _read(self, said: list[tuple[int, str, str]]) -> None:
+        parameters, steps = 0, []
+        for found in (FIELDS.search(line) for _, _, line in said):
+            if found is None:
+                continue
+            name, value = found[1], int(found[2])
+            if name.endswith("_pic_parameter_set_id"):
+                parameters = value
+            elif name == "init_qp_minus26":
+                self.usual[parameters] = 26 + value
+            elif name == "slice_qp_delta":
+                steps.append(STEPS[min(max(self.usual.get(parameters, 26) + value, -64), 63) + 64])
+            elif name == "base_q_idx":
+                steps.append(INDEXED[min(max(value, 0), 255)])
+        if steps:
+            self.step = float(np.sqrt(np.mean(np.square(steps))))
+
+
+def _coarser(said: bytes) -> float:
+    """How much coarser than by its steps alone a video is coded, by what its encoder said."""
+    found = SEARCHED.search(said)
+    return 1.0 if found is None else next((times for most, times in COARSER[found[1]] if int(found[2]) <= most), 1.0)
+
+
+def _harm(codec: str, steps: NDArray) -> NDArray:
+    """Steps of H.264 that do as much."""
+    factor, power = HARM[codec]
+    return factor * steps**power
+
+
+def _turned(steps: NDArray, frame: "av.VideoFrame") -> NDArray:
+    """Steps in squares (H / 16, W / 16), as the frame is to be shown."""
+    if turns := quarter_turns(frame):
+        whole = np.kron(steps, np.ones((MACROBLOCK, MACROBLOCK)))[: frame.height, : frame.width]
+        half = MACROBLOCK // 2
+        steps = np.rot90(whole, turns)[half::MACROBLOCK, half::MACROBLOCK]
+    return steps
+
+
+Coarseness = ByDecoder | ByHeaders
+
+
+def coarseness_of(stream: "av.video.stream.VideoStream") -> Coarseness | None:
+    """What tells how coarsely a stream was coded that has not been read yet; None where nothing does."""
+    codec = stream.codec_context.codec.canonical_name
+    if codec in ("hevc", "av1"):
+        return ByHeaders.of(stream, codec)
+    return ByDecoder() if codec in ("h264", "vp9", "mpeg4") else None
