@@ -48,28 +48,27 @@ def is_part(unit: bytes) -> bool:
 
 @dataclass
 class _Alone:
-    """A decoder that takes each packet for a video of its own."""
+    """Takes each packet for a video of its own.
 
-    context: "av.video.codeccontext.VideoCodecContext"
+    Each time by a new decoder: a used one takes the motion of pictures that it does not have from whatever was in its
+    memory before.
+    """
+
+    parameters: bytes | None
     units: Units
-
-    @classmethod
-    def of(cls, parameters: bytes | None, units: Units, rows_apart: bool) -> "_Alone":
-        context = av.codec.CodecContext.create("hevc", "r")
-        if parameters:
-            context.extradata = parameters
-        context.thread_type, context.thread_count = ("SLICE", 2) if rows_apart else ("NONE", 1)
-        context.options = ALONE
-        return cls(context, units)
+    rows_apart: bool
 
     def picture(self, units: list[bytes]) -> NDArray | None:
-        packet = av.Packet(self.units.joined(units))
+        context = av.codec.CodecContext.create("hevc", "r")
+        if self.parameters:
+            context.extradata = self.parameters
+        context.thread_type, context.thread_count = ("SLICE", 2) if self.rows_apart else ("NONE", 1)
+        context.options = ALONE
         with av.logging.Capture(local=True):
             try:
-                frames = [*self.context.decode(packet), *self.context.decode(None)]
+                frames = [*context.decode(av.Packet(self.units.joined(units))), *context.decode(None)]
             except av.FFmpegError:
                 frames = []
-            self.context.flush_buffers()
         return grey(frames[-1], copy=True) if frames else None
 
 
@@ -77,7 +76,7 @@ class _Looker:
     """Finds damage that decoders read in silence."""
 
     def __init__(self, parameters: bytes | None, units: Units) -> None:
-        self.rows_on, self.rows_apart = (_Alone.of(parameters, units, rows_apart) for rows_apart in (False, True))
+        self.rows_on, self.rows_apart = (_Alone(parameters, units, rows_apart) for rows_apart in (False, True))
 
     def is_sound(self, units: list[bytes]) -> bool:
         """Whether a picture's code is read to its end and no further; True where its decoder has no picture."""

@@ -186,6 +186,14 @@ def test_what_decoders_read_in_silence_is_hardly_ever_taken(
     assert copies <= most
 
 
+def test_intact_hevc_is_found_intact_time_and_again(tmp_path: Path) -> None:
+    """Its pictures take motion from earlier ones, and weights by it: on their own, from what must not be left over."""
+    path = tmp_path / "a.mp4"
+    write_video(path, "libx265", "yuv420p", options={"x265-params": "log-level=none:bframes=0:qp=24"})
+    for _ in range(30):
+        assert all(frame.picture is not None for frame in open_video(path).read())
+
+
 @pytest.mark.parametrize("others", ["bframes=0", "bframes=2"])
 def test_pictures_that_are_renewed_column_by_column_come_back_whole(tmp_path: Path, others: str) -> None:
     """H.264 without key frames but the first: the packet that begins a renewal passes for one."""
