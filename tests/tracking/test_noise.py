@@ -136,18 +136,27 @@ def test_motion_in_more_modes_than_can_be_told_apart_is_no_error(
     assert Others.of(pixel, np.full(pixel.shape, 0.02)) is None
 
 
+QUIET = {"x265-params": "log-level=none"}
+
+
 @pytest.mark.parametrize(
-    ("crf", "swing", "preset"),
+    ("codec", "options", "swing"),
     [
-        ("4", 2.0, "medium"),
-        ("23", 2.0, "medium"),
-        ("23", 20.0, "medium"),
-        ("28", 2.0, "medium"),
-        ("23", 2.0, "veryfast"),
-        ("23", 8.0, "faster"),
+        ("libx264", {"crf": "4"}, 2.0),
+        ("libx264", {"crf": "23"}, 2.0),
+        ("libx264", {"crf": "23"}, 20.0),
+        ("libx264", {"crf": "28"}, 2.0),
+        ("libx264", {"crf": "23", "preset": "veryfast"}, 2.0),
+        ("libx264", {"crf": "23", "preset": "faster"}, 8.0),
+        ("libx265", {"crf": "18"} | QUIET, 8.0),
+        ("libx265", {"crf": "23"} | QUIET, 20.0),
+        ("libx265", {"crf": "22", "preset": "ultrafast"} | QUIET, 8.0),
+        ("libsvtav1", {"crf": "30", "preset": "8"}, 8.0),
+        ("libvpx-vp9", {"crf": "31", "b": "0", "cpu-used": "5"}, 8.0),
+        ("mpeg4", {"qmin": "4", "qmax": "4"}, 8.0),
     ],
 )
-def test_sigma_knows_of_compression(tmp_path: Path, crf: str, swing: float, preset: str) -> None:
+def test_sigma_knows_of_compression(tmp_path: Path, codec: str, options: dict[str, str], swing: float) -> None:
     """A beam of dots that swings by up to 20 px, coded finely or so coarsely that most motion is passed over."""
     size, frames = (416, 320), 40
     column, row = np.meshgrid(np.arange(60, 400, 56.0), np.arange(60, 260, 50.0))
@@ -155,11 +164,11 @@ def test_sigma_knows_of_compression(tmp_path: Path, crf: str, swing: float, pres
     away = (rest[:, 0] / size[0]) ** 2 * np.sin(0.45 * np.arange(frames) + 1.0)[:, None]
     place = np.repeat(rest[None], frames, axis=0)
     place[..., 1] += swing * away
-    path = tmp_path / "a.mp4"
+    path = tmp_path / "a.mkv"
     with av.open(str(path), "w") as output:
-        stream = output.add_stream("libx264", rate=100)
+        stream = output.add_stream(codec, rate=100)
         stream.width, stream.height, stream.pix_fmt = *size, "yuv420p"
-        stream.options = {"crf": crf, "preset": preset}
+        stream.options = options
         for number in range(frames):
             dots = [(x, y, 8.0, 8.0, 0.0) for x, y in place[number]]
             frame = av.VideoFrame.from_ndarray(picture(dots, size, noise=3.0, seed=number), format="gray")
@@ -169,5 +178,5 @@ def test_sigma_knows_of_compression(tmp_path: Path, crf: str, swing: float, pres
     order = np.linalg.norm(place[0][:, None] - tracks.start[None], axis=2).argmin(axis=1)
     error, sigma = tracks.pixel[:, order] - place, tracks.sigma[:, order]
     assert 0.7 < np.sqrt((sigma**2).mean() / (error**2).mean()) < 1.8  # the upper end where the error is 0.004 px
-    assert np.mean(np.abs(error) < sigma) == pytest.approx(0.68, abs=0.14)
+    assert np.mean(np.abs(error) < sigma) == pytest.approx(0.68, abs=0.14 if codec == "libx264" else 0.24)
     assert np.mean((np.abs(error) > 0.25) & (np.abs(error) > 4.0 * sigma)) < 5e-3

@@ -210,7 +210,7 @@ def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path, name: str, cod
 
 
 def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
-    """H.264 whose macroblocks differ; at a fixed quantiser of 30, whose step is 20 levels; other codecs say none.
+    """H.264 whose macroblocks differ; at a fixed quantiser of 30, whose step is 20 levels; Motion JPEG says none.
 
     An encoder in a hurry counts as a coarser one.
     """
@@ -240,6 +240,39 @@ def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
     frame = next(iter(open_video(path.with_suffix(".avi")).read()))
     assert frame.steps is None
     assert np.isnan(frame.step_at(corners)).all()
+
+
+@pytest.mark.parametrize(("ending", "bits"), [("mp4", ""), ("ts", ""), ("mkv", "10le")])
+def test_steps_of_hevc_are_told(tmp_path: Path, ending: str, bits: str) -> None:
+    """At two fixed quantisers, six apart, of 8 or 10 bits; of first pictures they are three less."""
+    path, harm = tmp_path / f"a.{ending}", []
+    for quantiser in (24, 30):
+        said = {"x265-params": f"log-level=none:bframes=0:qp={quantiser}"}
+        write_video(path, "libx265", "yuv420p" + bits, options=said)
+        steps = [frame.steps for frame in open_video(path).read()]
+        assert all(each is not None and each.shape == (1, 1) for each in steps)
+        harm.append((steps[0].item(), steps[7].item()))
+    assert harm[1][0] == pytest.approx(harm[0][1] * 2.0 ** (0.5 * 1.48), rel=1e-6)
+    assert harm[1][1] == pytest.approx(harm[0][1] * 2.0**1.48, rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("codec", "finer", "coarser"),
+    [
+        ("mpeg4", {"qmin": "3", "qmax": "3"}, {"qmin": "9", "qmax": "9"}),
+        ("libvpx-vp9", {"crf": "15", "b": "0"}, {"crf": "45", "b": "0"}),
+        ("libsvtav1", {"crf": "15", "preset": "10"}, {"crf": "45", "preset": "10"}),
+    ],
+)
+def test_steps_of_other_codecs_are_told(
+    tmp_path: Path, codec: str, finer: dict[str, str], coarser: dict[str, str]
+) -> None:
+    path, means = tmp_path / "a.mkv", []
+    for options in (finer, coarser):
+        write_video(path, codec, "yuv420p", options=options)
+        told = [frame.steps for frame in open_video(path).read() if frame.steps is not None]
+        means.append(np.mean([each.mean() for each in told]))
+    assert means[1] > 1.5 * means[0] > 1.0
 
 
 def test_sixteen_bit_pictures(tmp_path: Path) -> None:
