@@ -97,11 +97,12 @@ def ramp(frame: int) -> np.ndarray:
 
 def write_video(
     path: Path, codec: str, pixels: str, rate: int = 100, options: dict[str, str] | None = None,
-    pictures: list[np.ndarray] | None = None,
+    pictures: list[np.ndarray] | None = None, title: str = "",
 ) -> None:  # fmt: skip
     """Of pictures (H, W), or of ramps that grow lighter."""
     pictures = pictures or [ramp(number) for number in range(FRAMES)]
     with av.open(str(path), "w") as output:
+        output.metadata["title"] = title
         stream = output.add_stream(codec, rate=rate)
         stream.height, stream.width = pictures[0].shape
         stream.pix_fmt = pixels

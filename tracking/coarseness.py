@@ -87,40 +87,48 @@ class ByHeaders:
     Attributes:
         costly: see `ByDecoder`.
         codec: HEVC or AV1, by FFmpeg's name.
-        coarser: see `ByDecoder`.
+        parameters: the file's own headers.
         speller: reads headers.
+        coarser: see `ByDecoder`.
         usual: quantisers of HEVC, by their parameters' number.
         step: of the last packet that said.
     """
 
     costly: ClassVar[bool] = False
     codec: str
-    coarser: float
+    parameters: bytes
     speller: "av.bitstream.BitStreamFilterContext"
+    coarser: float = 0.0
     usual: dict[int, int] = field(default_factory=dict)
     step: float = np.nan
 
     @classmethod
-    def of(cls, stream: "av.video.stream.VideoStream", codec: str) -> "ByHeaders":
-        """Of a stream that has not been read yet."""
+    def of(cls, stream: "av.video.stream.VideoStream", codec: str) -> "ByHeaders | None":
+        """Of a stream that has not been read yet; None where its own headers cannot be read."""
         with av.logging.Capture(local=True) as said:
-            coarser = _coarser(stream.codec_context.extradata or b"")
-            coarseness = cls(codec, coarser, av.bitstream.BitStreamFilterContext("trace_headers", stream))
+            try:
+                speller = av.bitstream.BitStreamFilterContext("trace_headers", stream)
+            except av.FFmpegError:
+                return None
+        coarseness = cls(codec, stream.codec_context.extradata or b"", speller)
         coarseness._read(said)
         return coarseness
 
     def look(self, packet: "av.packet.Packet") -> None:
         """At the next packet, before its frames."""
+        content = bytes(packet)
+        if not self.coarser:
+            self.coarser = _coarser(self.parameters + content)
         with av.logging.Capture(local=True) as said:
             try:
-                self.speller.filter(av.Packet(bytes(packet)))
+                self.speller.filter(av.Packet(content))
             except av.FFmpegError:
                 return
         self._read(said)
 
-    def tells_of(self, number: int) -> bool:
+    def tells_of(self, _: int) -> bool:
         """Whether to ask for a frame's steps."""
-        return number >= 0 and bool(np.isfinite(self.step))
+        return bool(np.isfinite(self.step))
 
     def steps(self, frame: "av.VideoFrame") -> NDArray:
         """Of a frame of the last packet, (1, 1)."""

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from groundwork import InputError
 from tracking.ahead import ahead
-from tracking.ffmpeg import FFmpegDecoder, Outcome, packets_of
+from tracking.ffmpeg import FFmpegDecoder, Outcome, opened, packets_of
 from tracking.frame import Frame
 from tracking.hevc import HevcDecoder
 from tracking.jpeg import JpegDecoder
@@ -65,7 +65,7 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
 def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
     """A video file's packets and what they decode to; whatever can be left to another thread is."""
     with ExitStack() as stack:
-        container = stack.enter_context(av.open(str(path)))
+        container = stack.enter_context(opened(path))
         stream = container.streams.video[0]
         codec = stream.codec_context.codec
         count = min(MOST_DECODERS, os.cpu_count() or 1, _decoders_worth(path)) if codec.intra_only else 1
@@ -77,7 +77,7 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
             decoders = [HevcDecoder.of(stream, stack.enter_context(ThreadPoolExecutor(cores)), cores).decode]
         else:
             streams = [stream]
-            streams += [stack.enter_context(av.open(str(path))).streams.video[0] for _ in range(1, count)]
+            streams += [stack.enter_context(opened(path)).streams.video[0] for _ in range(1, count)]
             decoders = [FFmpegDecoder(each).decode for each in streams]
         renewals = Renewals(Units.of("h264", stream.codec_context.extradata)) if codec.name == "h264" else None
         for packet, frames, damaged in _all_decoded(packets_of(container, stream, notes), decoders):
@@ -89,7 +89,7 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
 
 def _decoders_worth(path: Path) -> int:
     """How many decoders keep pace with following the dots, by the size of a video's first packet."""
-    with av.open(str(path)) as container:
+    with opened(path) as container:
         first = next(packets_of(container, container.streams.video[0], []), None)
         return 1 + (0 if first is None else first.size // BYTES_EACH)
 

@@ -3,6 +3,7 @@
 import gc
 import logging
 from collections.abc import Iterator
+from pathlib import Path
 
 import av
 import numpy as np
@@ -80,6 +81,11 @@ class FFmpegDecoder:
                 return [], True
         complaints = any(level <= av.logging.ERROR for level, _, _ in messages)
         return frames, complaints or packet.is_corrupt
+
+
+def opened(path: Path) -> "av.container.InputContainer":
+    """A video file, in whatever letters a camera wrote its name and time."""
+    return av.open(str(path), metadata_errors="replace")
 
 
 def packets_of(

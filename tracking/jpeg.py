@@ -13,7 +13,7 @@ import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
 
-from tracking.ffmpeg import FFmpegDecoder, Outcome, grey, packets_of
+from tracking.ffmpeg import FFmpegDecoder, Outcome, grey, opened, packets_of
 from tracking.frame import quarter_turns
 from tracking.order import Decoded
 
@@ -47,7 +47,7 @@ class JpegDecoder:
         """For a video that it reads as FFmpeg does; None for others, as some cameras leave bytes where none belong."""
         agreed: list[JpegDecoder] = []
         refused = 0
-        with av.open(str(path)) as container:
+        with opened(path) as container:
             stream = container.streams.video[0]
             ffmpeg = FFmpegDecoder(stream)
             for packet in islice(packets_of(container, stream, []), PROBED):

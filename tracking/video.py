@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from groundwork import InputError
 from tracking.ahead import ahead
 from tracking.decoding import frames_of_file
+from tracking.ffmpeg import opened
 from tracking.frame import Frame, quarter_turns, scaled
 from tracking.jpeg import PROBED, is_whole
 
@@ -97,7 +98,7 @@ def open_video(path: Path) -> Video:
             raise InputError(f"expected pictures in {path}, none of which can be read; copy them again")
         return Video(path, (first.shape[1], first.shape[0]), len(pictures), 0.0)
     try:
-        with av.open(str(path)) as container:
+        with opened(path) as container:
             if not container.streams.video:
                 raise InputError(f"expected a video in {path}, found no video stream; export it again")
             stream = container.streams.video[0]

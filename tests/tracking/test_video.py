@@ -256,6 +256,15 @@ def test_steps_of_hevc_are_told(tmp_path: Path, ending: str, bits: str) -> None:
     assert harm[1][1] == pytest.approx(harm[0][1] * 2.0**1.48, rel=1e-6)
 
 
+def test_names_in_any_letters_are_read(tmp_path: Path) -> None:
+    """A title in Latin letters that are no UTF-8, as older cameras and programs write them."""
+    path = tmp_path / "a.mp4"
+    write_video(path, "libx264", "yuv420p", title="MESSGERAET")
+    path.write_bytes(path.read_bytes().replace(b"MESSGERAET", "MESSGERÄTE".encode("latin-1")))
+    assert b"\xc4" in path.read_bytes()
+    assert sum(frame.picture is not None for frame in open_video(path).read()) == 12
+
+
 @pytest.mark.parametrize(
     ("codec", "finer", "coarser"),
     [
