@@ -291,7 +291,8 @@ class Tracker:
         """Which markers are seen, and not by dots that could as well be another's.
 
         Those that were in sight before; and of the others those whose dots lie where these put them, less than half as
-        far from there as from where they put another marker out of sight, one by one, each a help for the next.
+        far from there as from where they put another marker out of sight, one by one, each a help for the next. If all
+        out of sight are back, it is enough that two dots lie less than half as far off as if they were exchanged.
         """
         shown = np.isfinite(dots.sigma[:, 0])
         if not self.missing.any():
@@ -302,8 +303,12 @@ class Tracker:
             asked, out = np.flatnonzero(shown & ~sure), np.flatnonzero(~sure)
             gaps = np.linalg.norm(dots.centre[asked][:, None] - place[out], axis=2)
             mine = asked[:, None] == out
-            own, other = gaps[mine], np.where(mine, np.inf, gaps).min(axis=1)
-            clear = (own < DISPUTED * other) & (own < DISPUTED * self.pattern.spacing[asked])
+            own, other = gaps[mine], np.where(mine, np.inf, gaps)
+            clear = own < DISPUTED * other.min(axis=1)
+            if len(asked) == len(out):
+                kept, exchanged = np.hypot(own[:, None], own), np.hypot(other, other.T)
+                clear |= (kept < DISPUTED * exchanged).all(axis=1)
+            clear &= own < DISPUTED * self.pattern.spacing[asked]
             if not clear.any():
                 return sure
             sure[asked[clear]] = True

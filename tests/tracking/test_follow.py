@@ -155,6 +155,17 @@ def test_who_comes_back_into_a_curl_is_not_taken_for_its_neighbour() -> None:
     assert np.isfinite(away[~behind]).mean() > 0.7
 
 
+def test_two_that_come_back_together_are_told_apart_by_each_other() -> None:
+    """A third and a half of a spacing off, one nearly as near to the other's place; exchanged, both were far off."""
+    truth = np.repeat(grid()[None], 8, axis=0)
+    truth[1:4, [7, 15]] = np.nan
+    truth[4:, [7, 15], 1] -= np.array([0.53, 0.345]) * 34.0
+    tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
+    found = tracks.pixel[:, order(tracks.start, truth[0])]
+    assert np.isnan(found[1:4, [7, 15]]).all()
+    assert np.abs(found[5:] - truth[5:]).max() < 0.3  # they are looked for in every fourth frame
+
+
 def test_dots_hidden_at_first_are_taken_in() -> None:
     """A hand holds the specimen for fifteen frames, then it swings; the dots are known from the moment they show."""
     rest = grid()
