@@ -135,17 +135,17 @@ class ByHeaders:
         return self.coarser * _harm(self.codec, np.full((1, 1), self.step))
 
     def _read(self, said: list[tuple[int, str, str]]) -> None:
-        parameters, steps = 0, []
+        number, steps = 0, []
         for found in (FIELDS.search(line) for _, _, line in said):
             if found is None:
                 continue
             name, value = found[1], int(found[2])
             if name.endswith("_pic_parameter_set_id"):
-                parameters = value
+                number = value
             elif name == "init_qp_minus26":
-                self.usual[parameters] = 26 + value
+                self.usual[number] = 26 + value
             elif name == "slice_qp_delta":
-                steps.append(STEPS[min(max(self.usual.get(parameters, 26) + value, -64), 63) + 64])
+                steps.append(STEPS[min(max(self.usual.get(number, 26) + value, -64), 63) + 64])
             elif name == "base_q_idx":
                 steps.append(INDEXED[min(max(value, 0), 255)])
         if steps:

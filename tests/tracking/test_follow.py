@@ -238,11 +238,11 @@ def test_stains_of_the_skin_are_no_markers() -> None:
     for seed in range(6):
         random = np.random.default_rng(seed)
         skin = picture([(x, y, 6.0, 6.0, 0.0) for x, y in dots], (640, 480), noise=2.0, seed=seed, contrast=60.0)
-        mottled = skin + cv2.resize(random.normal(0.0, 6.0, (62, 82)), (640, 480), interpolation=cv2.INTER_CUBIC)
+        mottled = skin + cv2.resize(random.normal(0.0, 8.0, (62, 82)), (640, 480), interpolation=cv2.INTER_CUBIC)
         found = find_family(np.clip(np.rint(mottled), 0, 255).astype(np.uint8))
         assert found is not None
         away = np.linalg.norm(found[1].centre[:, None] - dots, axis=2)
-        assert away.min(axis=0).max() < 0.5
+        assert away.min(axis=0).max() < 1.0  # what lies around a dot pulls it
         false += len(found[1]) - 24
     assert false <= 4
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support import FRAMES, ramp, write_video
 
+from tracking.coarseness import HARM
 from tracking.decoding import Decoder, _all_decoded, frames_of_file
 from tracking.order import Decoded, Order, Piece
 from tracking.video import open_video
@@ -244,16 +245,16 @@ def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("ending", "bits"), [("mp4", ""), ("ts", ""), ("mkv", "10le")])
 def test_steps_of_hevc_are_told(tmp_path: Path, ending: str, bits: str) -> None:
-    """At two fixed quantisers, six apart, of 8 or 10 bits; of first pictures they are three less."""
-    path, harm = tmp_path / f"a.{ending}", []
-    for quantiser in (24, 30):
+    """At quantisers of 24 and 30, whose steps are 10 and 20 levels, of 8 or 10 bits; of first pictures three less."""
+    path = tmp_path / f"a.{ending}"
+    factor, power = HARM["hevc"]
+    for quantiser, step in ((24, 10.0), (30, 20.0)):
         said = {"x265-params": f"log-level=none:bframes=0:qp={quantiser}"}
         write_video(path, "libx265", "yuv420p" + bits, options=said)
-        steps = [frame.steps for frame in open_video(path).read()]
-        assert all(each is not None and each.shape == (1, 1) for each in steps)
-        harm.append((steps[0].item(), steps[7].item()))
-    assert harm[1][0] == pytest.approx(harm[0][1] * 2.0 ** (0.5 * 1.48), rel=1e-6)
-    assert harm[1][1] == pytest.approx(harm[0][1] * 2.0**1.48, rel=1e-6)
+        told = np.array([np.full((1, 1), np.nan) if it.steps is None else it.steps for it in open_video(path).read()])
+        assert told.shape == (12, 1, 1)
+        own = (told.ravel() / factor) ** (1.0 / power)
+        np.testing.assert_allclose(own, [step / np.sqrt(2.0), *[step] * 11], rtol=1e-6)
 
 
 def test_names_in_any_letters_are_read(tmp_path: Path) -> None:
