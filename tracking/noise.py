@@ -58,7 +58,7 @@ def places_and_errors(pixel: Array, fitted: Array, leverage: Array, step: Array)
     whole = with_shared_errors(expected, others)
     if not others.are_many:
         return pixel, whole
-    off, mended = mendable(pixel, fitted, coding, others, coarseness(fitted, leverage, step))
+    off, mended = mendable(pixel, fitted, coding, others, step_over_noise(fitted, leverage, step))
     return pixel - off, np.where(np.isnan(mended), whole, mended)
 
 
@@ -80,7 +80,7 @@ def coding_errors(pixel: Array, fitted: Array, leverage: Array, step: Array) -> 
     return np.where(moves, np.maximum(LAGGING * rounded**POWER, still), still)
 
 
-def coarseness(fitted: Array, leverage: Array, step: Array) -> float:
+def step_over_noise(fitted: Array, leverage: Array, step: Array) -> float:
     """The steps over the noise that the first picture shows, the finest coded; 0 where nothing is known.
 
     Noise keeps an encoder from passing over the same change everywhere. Arguments as for `places_and_errors`.
@@ -218,7 +218,7 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others, coarse:
         fitted: standard deviations from the fits [px], (T, D, 2).
         coding: those by coding [px], (T, D, 2).
         others: motion of these paths.
-        coarse: as `coarseness` has it.
+        coarse: as `step_over_noise` has it.
     """
     where = np.ix_(others.frames, others.markers)
     square, shown = coding[where] ** 2, fitted[where] ** 2
