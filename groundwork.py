@@ -86,7 +86,12 @@ def whole_file(path: Path) -> Iterator[Path]:
 
     On any failure the temporary file is removed and what stood at `path` is untouched. Temporary files of
     programs that were killed are removed too.
+
+    Raises:
+        InputError: a folder stands at `path`.
     """
+    if path.is_dir():
+        raise InputError(f"expected a file to write at {path}, found a folder; name a file in it")
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_abandoned(path)
     prefix = f".{path.stem}-{platform.node()}-{os.getpid()}-"
@@ -145,15 +150,7 @@ def read_yaml(path: Path, model: type[Model], what: str, version: str) -> Model:
         InputError: no such file, not YAML, of another format or a newer version, an unknown or missing
             key, a value of another kind.
     """
-    require_file(path, what)
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"expected {what} in {path}, which is not readable as YAML: {reason}") from None
-    if not isinstance(content, dict):
-        raise InputError(f"expected {what} in {path}, found no keys and values; is it the right file?")
-    check_format(str(content.get("format", "no `format:`")), version, path)
+    content = yaml_content(path, what, version)
     try:
         return model.model_validate(content)
     except pydantic.ValidationError as error:
@@ -163,6 +160,24 @@ def read_yaml(path: Path, model: type[Model], what: str, version: str) -> Model:
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         message = first["msg"].removeprefix("Value error, ")
         raise InputError(f"{what} {path}: {key}: {message}{found}; correct that key{more}") from None
+
+
+def yaml_content(path: Path, what: str, version: str) -> dict[str, Any]:
+    """The keys and values of a YAML file of format `version` (`name/number`), `format` among them.
+
+    Raises:
+        InputError: no such file, not YAML, of another format or a newer version.
+    """
+    require_file(path, what)
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:  # the last of brackets hundreds deep
+        reason = " ".join(str(error).split())
+        raise InputError(f"expected {what} in {path}, which is not readable as YAML: {reason}") from None
+    if not isinstance(content, dict):
+        raise InputError(f"expected {what} in {path}, found no keys and values; is it the right file?")
+    check_format(str(content.get("format", "no `format:`")), version, path)
+    return content
 
 
 def check_format(found: str, expected: str, path: Path) -> None:

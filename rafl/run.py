@@ -11,7 +11,7 @@ import pandas as pd
 import torch
 import yaml
 
-from groundwork import InputError, check_format, require_file, whole_file, write_text
+from groundwork import InputError, check_format, require_file, whole_file, write_text, yaml_content
 from rafl.global_residual import GlobalResidual
 from rafl.integrator import INTEGRATORS
 from rafl.parameters import Parameters
@@ -108,12 +108,12 @@ def read_settings(run: Path) -> Settings:
     Raises:
         InputError: not a run folder, or a newer one.
     """
-    path = require_file(run / "config.yaml", "a run folder's settings (written by rafl-fit)")
+    path = run / "config.yaml"
+    content = yaml_content(path, "a run folder's settings (written by rafl-fit)", FORMAT)
+    del content["format"]
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-        check_format(str(content.pop("format", "")), FORMAT, path)
         return Settings(**{**content, "datasets": tuple(content["datasets"])})
-    except (yaml.YAMLError, TypeError, KeyError, AttributeError) as error:
+    except (TypeError, KeyError) as error:
         raise InputError(f"expected settings written by rafl-fit in {path}: {error}; fit again") from None
 
 

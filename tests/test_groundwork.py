@@ -34,10 +34,17 @@ def test_a_whole_write_replaces_the_file(tmp_path: Path) -> None:
     assert path.stat().st_mode & 0o044
 
 
+def test_a_folder_in_the_place_of_a_file_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="found a folder"), whole_file(tmp_path):
+        pass
+    assert not list(tmp_path.parent.glob(f".{tmp_path.name}*"))
+
+
 @pytest.mark.parametrize(
     ("text", "part"),
     [
         ("length_mm: [", "not readable as YAML"),
+        ("a: " + 500 * "[" + 500 * "]", "not readable as YAML"),
         ("- 1", "no keys and values"),
         ("length_mm: 1", "rafl-thing/1"),
         ("format: rafl-other/1", "rafl-other/1"),
