@@ -199,9 +199,10 @@ def evaluate(
     runs = [path for path in paths if path.suffix != ".h5"]
     files = [path for path in paths if path.suffix == ".h5"]
     if not runs or not files:
+        absent = "run folder" if files else "dataset (.h5)"
         raise InputError(
-            f"expected at least one run folder and one dataset (.h5), found {len(runs)} and {len(files)}; "
-            "for instance rafl-eval runs/thick datasets/thick.h5"
+            f"expected at least one run folder and one dataset (.h5), found no {absent} among "
+            f"{', '.join(map(str, paths))}; for instance rafl-eval runs/thick datasets/thick.h5"
         )
     models = _named_models(runs)
     datasets = [read_dataset(path) for path in files]

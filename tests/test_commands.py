@@ -80,6 +80,7 @@ def test_tracking_refuses(videos: Path, run: Run, tmp_path: Path) -> None:
     extra = {"other.yaml", "videos/swing/broken.png"}
     refused("nowhere.yaml", "check the path", calib="nowhere.yaml")
     refused("nothing", path=tmp_path / "nothing")
+    refused(".mp4", "calib.yaml, found a file of another kind", path=tmp_path / "calib.yaml")
     write_rig(tmp_path / "other.yaml", Rig({"front": camera((640, 480))}))
     refused("swing", "expected 640 x 480", "found 200 x 160", calib="other.yaml")
     write_rig(tmp_path / "other.yaml", Rig({"left": camera(), "right": camera()}))
@@ -241,7 +242,10 @@ def test_fit_and_eval_refuse(built: Dataset, run: Run, tmp_path: Path) -> None:
     assert_refused(run("rafl-fit", "a.h5"), "a.h5", "cannot be read")
 
     write_dataset(tmp_path / "a.h5", built)
-    assert_refused(run("rafl-eval", "a.h5"), "at least one run folder and one dataset")
+    assert_refused(run("rafl-eval", "a.h5"), "at least one run folder and one dataset", "no run folder")
+    (tmp_path / "odd").mkdir()
+    (tmp_path / "odd" / "config.yaml").write_bytes(b"\xff\xfe")
+    assert_refused(run("rafl-fit", "a.h5", "--out", "odd", "--epochs", "1", "--resume"), "config.yaml", "as YAML")
     assert_refused(run("rafl-eval", "nowhere", "a.h5"), "nowhere/model.pt")
     assert_refused(run("rafl-fit", "a.h5", "--out", "a.h5/run"), "a.h5", "check the path")
     done = run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1", "--frames", "3")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from calibration.rig import Rig
 from groundwork import InputError
-from tracking.video import Video, is_video, natural_key, open_video
+from tracking.video import VIDEO_SUFFIXES, Video, is_video, natural_key, open_video
 
 
 def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Video]]:
@@ -19,11 +19,16 @@ def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, 
         calib: the rig's file, for messages.
 
     Raises:
-        InputError: nothing found, a video of a camera the rig lacks, a recording without one of the
-            rig's cameras, an unreadable video, or one of another size than its camera's.
+        InputError: nothing found, a file that is no video, a video of a camera the rig lacks, a recording without one
+            of the rig's cameras, an unreadable video, or one of another size than its camera's.
     """
     if not videos.exists():
         raise InputError(f"expected videos at {videos}, found nothing there; check the path")
+    if videos.is_file() and not is_video(videos):
+        raise InputError(
+            f"expected a folder of videos or a video ({', '.join(sorted(VIDEO_SUFFIXES))}) at {videos}, found "
+            "a file of another kind; check the path"
+        )
     found: dict[str, dict[str, Path]] = {}
 
     def add(recording: str, camera: str, path: Path) -> None:
