@@ -16,8 +16,9 @@ import pandas as pd
 import torch
 from scipy.optimize import curve_fit
 
-from capture.build import CaptureSettings, build_dataset, read_recording_rows
+from capture.build import CaptureSettings, build_dataset
 from capture.specimen import read_specimen
+from capture.table import read_recording_rows
 from rafl.dataset import Dataset
 from rafl.material import Material
 from rafl.objective import Recordings, frame_errors
