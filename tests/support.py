@@ -111,3 +111,11 @@ def write_video(
             frame = av.VideoFrame.from_ndarray(picture, format="gray")
             output.mux(stream.encode(frame.reformat(format=pixels)))
         output.mux(stream.encode())
+
+
+def curled(turn: float, pairs: int = 7) -> np.ndarray:
+    """Pairs of markers on a strip (2 * pairs, 2) [px], 30 px apart; from the second on each turns on by that much."""
+    angle = turn * np.arange(pairs)
+    step = 30.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    normal = 16.0 * np.stack([-np.sin(angle), np.cos(angle)], axis=1)
+    return np.stack([np.cumsum(step, axis=0) + normal, np.cumsum(step, axis=0) - normal], axis=1).reshape(-1, 2)

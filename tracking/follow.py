@@ -3,37 +3,26 @@
 import heapq
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from groundwork import InputError
-from tracking.affine import carry
-from tracking.cut import WholeLooks
-from tracking.disc import PARAMETERS
-from tracking.dots import SAME_PLACE, SHADES, Dots, apart, eight_bits, find_spots, fit_dots, shade_of, start_of
-from tracking.family import Family, find_family
+from tracking.dots import Dots, eight_bits
+from tracking.family import find_family
 from tracking.frame import Frame
-from tracking.memory import Memory
-from tracking.motion import Motion
-from tracking.newcomers import Newcomer, Newcomers
+from tracking.newcomers import Newcomer
 from tracking.noise import places_and_errors
-from tracking.shape import Pattern, recognise
+from tracking.tracker import Tracker
 from tracking.video import Video
 
 Array = NDArray[Any]
 
 FEWEST_MARKERS = 3
 WORST = 10  # frames whose pictures are kept
-CALM = 0.22  # spacings: surprise up to which the dot at a marker's predicted place is its own
-STRAY = 0.33  # spacings: how far from its prediction a dot found there may be
-SEED_REACH = 2.2  # spacings: how far from where it is expected a marker may be
-DISPUTED = 0.5  # of the distance from another marker's place: how far from its own a dot that comes back may be
-RECHECK = 4  # frames between searches for markers out of sight
 NOTHING = np.empty((0, 2))
 
 
@@ -181,185 +170,3 @@ class _Album:
         return {
             number: cv2.imencode(".jpg", eight_bits(picture), quality)[1].tobytes() for number, picture in kept.items()
         }
-
-
-class Tracker:
-    """Follows the markers of one camera from picture to picture."""
-
-    def __init__(self, family: Family, first: Dots) -> None:
-        self.family = family
-        self.pattern = Pattern.of(first.centre)
-        self.parameters = first.parameters.copy()
-        self.motion = Motion(first.centre)
-        self.memory = Memory(first.centre)
-        self.missing = np.zeros(len(first), dtype=np.int64)  # frames since each was seen
-        self.searched = 0  # frames since the last search
-        self.newcomers = Newcomers(family)
-        self.looks = WholeLooks.none(len(first))
-
-    def advance(self, image: NDArray) -> Dots:
-        """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
-        expected = self._expected()
-        dots = None
-        if self.motion.surprise.min() < CALM:
-            dots = self._where_expected(image, expected)
-        self.searched += 1
-        if dots is None or not self._holds(dots) or self.searched >= self._patience():
-            found = self._search(image, expected)
-            better = dots is None or np.isfinite(found.sigma[:, 0]).sum() > np.isfinite(dots.sigma[:, 0]).sum()
-            dots = found if better or dots is None else dots
-            self.searched = 0
-        dots = self.looks.judge(image, _only(dots, self._undisputed(dots)))
-        self._learn(dots)
-        return dots
-
-    def pass_over(self) -> None:
-        """A frame that shows nothing."""
-        self.motion.remember(self._expected())
-        self.missing += 1
-
-    def look_out(self, number: int, image: NDArray) -> list[Newcomer]:
-        """After `advance`: markers that have become known, followed from now on."""
-        place, seen = self.motion.last, self.missing == 0
-        found = self.newcomers.look(number, image, place, seen, self.pattern, self.parameters)
-        for newcomer in found:
-            rest = self.pattern.rest
-            places = np.concatenate([carry(rest, place, newcomer.rest[None]) for place in self.motion.places])
-            if number in newcomer.seen:
-                places[-1] = newcomer.seen[number][0]
-            self.motion.join(places)
-            self.memory.join(newcomer.rest)
-            self.looks.join()
-            self.pattern = Pattern.of(np.concatenate([rest, newcomer.rest[None]]))
-            self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
-            self.missing = np.append(self.missing, 0 if number in newcomer.seen else 1)
-        return found
-
-    def _holds(self, dots: Dots) -> bool:
-        """Whether all markers that were in sight are among the dots, and some were."""
-        wanted = self.missing == 0
-        return bool(wanted.any()) and not np.isnan(dots.sigma[wanted]).any()
-
-    def _patience(self) -> float:
-        return RECHECK if self.missing.any() else np.inf
-
-    def _expected(self) -> Array:
-        """Where the motion so far puts the markers; those out of sight where the others carry them."""
-        if not self.missing.any():
-            return self.motion.expected()
-        seen = self.missing == 0
-        return self.memory.carried(self.motion.expected(), seen) if seen.any() else self.motion.last
-
-    def _where_expected(self, image: NDArray, expected: Array) -> Dots | None:
-        """The dots at the markers' expected places; None where they are not all their own."""
-        start = self.parameters.copy()
-        start[:, :2] = expected
-        dots = fit_dots(image, start)
-        good = self.family.admits(dots)
-        same = SAME_PLACE * self.family.radius
-        calm = _own(dots.parameters, self.parameters, expected, self.missing, self.pattern.spacing, same, good)
-        return _only(dots, good) if calm else None
-
-    def _search(self, image: NDArray, expected: Array) -> Dots:
-        """Every dot near the body, matched to the markers all at once."""
-        hidden = int(self.missing.min())
-        uncertain = 1.0 + 0.3 * min(hidden, 10)
-        margin = (SEED_REACH + 1.0) * float(np.median(self.pattern.spacing)) + 2.0 * self.family.radius
-        margin *= uncertain
-        low, high = expected.min(0) - margin, expected.max(0) + margin
-        shape = np.median(self.parameters[:, 2:5], axis=0)
-        level = float(np.median(self.parameters[:, 9]))
-        region = int(low[0]), int(low[1]), int(high[0]), int(high[1])
-        least = self.family.least(float(np.nanmin(np.abs(self.parameters[:, 8]))))
-        spots = find_spots(image, self.family.radius, least, region)
-        starts = [start_of(x, y, shape, self.family.contrast, level) for x, y in spots]
-        dots = fit_dots(image, np.array(starts).reshape(-1, PARAMETERS))
-        dots = apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
-        speed = np.linalg.norm(expected - self.motion.last, axis=1) / self.pattern.spacing
-        trusted = -speed - 0.2 * np.minimum(self.missing, 10)
-        surprise = float(self.motion.surprise.min())
-        sureness = 0.0 if hidden else 1.0 / (1.0 + (2.0 * surprise) ** 2) if np.isfinite(surprise) else 0.3
-        steady = np.zeros(len(expected))
-        if (self.missing > 0).any() and surprise < CALM:  # who is out of sight could take the place of who is in sight
-            steady[self.missing == 0] = 1.0 - surprise / CALM
-        reach = SEED_REACH * uncertain
-        match = recognise(self.pattern, self.motion.last, expected, trusted, dots.centre, reach, sureness, steady)
-        chosen = dots[np.maximum(match, 0)] if len(dots) else Dots.none(len(match))
-        return _only(chosen, match >= 0)
-
-    def _undisputed(self, dots: Dots) -> NDArray[np.bool_]:
-        """Which markers are seen, and not by dots that could as well be another's.
-
-        Those that were in sight before; and of the others those whose dots lie where these put them, less than half as
-        far from there as from where they put another marker out of sight, one by one, each a help for the next. If all
-        out of sight are back, it is enough that two dots lie less than half as far off as if they were exchanged.
-        """
-        shown = np.isfinite(dots.sigma[:, 0])
-        if not self.missing.any():
-            return shown
-        sure = shown & (self.missing == self.missing.min())
-        while sure.any() and (shown & ~sure).any():
-            place = self.memory.carried(dots.centre, sure)
-            asked, out = np.flatnonzero(shown & ~sure), np.flatnonzero(~sure)
-            gaps = np.linalg.norm(dots.centre[asked][:, None] - place[out], axis=2)
-            mine = asked[:, None] == out
-            own, other = gaps[mine], np.where(mine, np.inf, gaps)
-            clear = own < DISPUTED * other.min(axis=1)
-            if len(asked) == len(out):
-                kept, exchanged = np.hypot(own[:, None], own), np.hypot(other, other.T)
-                clear |= (kept < DISPUTED * exchanged).all(axis=1)
-            clear &= own < DISPUTED * self.pattern.spacing[asked]
-            if not clear.any():
-                return sure
-            sure[asked[clear]] = True
-        return shown
-
-    def _learn(self, dots: Dots) -> None:
-        seen, place = np.isfinite(dots.sigma[:, 0]), dots.centre
-        self.motion.judge(place, seen & (self.missing == 0), self.pattern.spacing)
-        if not seen.all():
-            place = np.where(seen[:, None], place, self._expected())
-            place = self.memory.carried(place, seen)
-        self.memory.add(place, seen)
-        self.motion.remember(place)
-        self.missing = np.where(seen, 0, self.missing + 1)
-        self.parameters[seen] = dots.parameters[seen]
-
-
-@njit(cache=True)
-def _own(parameters, before, expected, missing, spacing, same, good):  # type: ignore[no-untyped-def]
-    """Leaves in good (M) the markers whose own dots these are; False where too few lie near their expected places.
-
-    before: parameters in the picture before. same: distance below which two dots are one.
-    """
-    count = len(good)
-    centre = parameters[:, :2]
-    seen = near = 0
-    for k in range(count):
-        away = np.hypot(centre[k, 0] - expected[k, 0], centre[k, 1] - expected[k, 1]) / spacing[k]
-        change = parameters[k, 8] / before[k, 8]
-        if good[k] and not 0.5 < change < 2.0:  # in changing light only by as much as its surroundings' level
-            shade, earlier = shade_of(parameters[k, 8], parameters[k, 9]), shade_of(before[k, 8], before[k, 9])
-            good[k] = change > 0.0 and abs(np.log(shade / earlier)) < SHADES
-        good[k] = good[k] and away < STRAY
-        if good[k] and missing[k] == 0:
-            seen += 1
-            near += away < CALM
-    if 2 * near < seen or seen == 0:
-        return False
-    shared = np.zeros(count, np.bool_)
-    for k in range(count):
-        for other in range(k):
-            if good[k] and good[other]:
-                x, y = centre[k, 0] - centre[other, 0], centre[k, 1] - centre[other, 1]
-                if x * x + y * y < same * same:
-                    shared[k] = shared[other] = True
-    good &= ~shared
-    return True
-
-
-def _only(dots: Dots, good: NDArray[np.bool_]) -> Dots:
-    """The same dots, the others' sigma NaN."""
-    if good.all():
-        return dots
-    return replace(dots, sigma=np.where(good[:, None], dots.sigma, np.nan))

@@ -43,11 +43,16 @@ class Motion:
         """
         if known.any():
             _judge(self.places, self.count, self._swing, found, known, spacing, self.surprise)
-        else:
-            self.surprise[:] = np.inf
 
-    def remember(self, place: NDArray[np.float64]) -> None:
-        """The markers' places (M, 2) in the new picture, seen or believed."""
+    def forget(self) -> None:
+        """Nothing is known of the motion up to now."""
+        self.count = 0
+        self.surprise[:] = np.inf
+
+    def remember(self, place: NDArray[np.float64], back: NDArray[np.bool_]) -> None:
+        """The markers' places (M, 2) in the new picture, seen or believed; those that are back (M) go on as guessed."""
+        if back.any():
+            self.places[:, back] += (place - self.expected())[back]
         self.count = min(self.count + 1, REMEMBERED)
         self.places = _remembered(self.places, self.count, self._swing, place)
 

@@ -23,7 +23,11 @@ Array = NDArray[Any]
 EVERY, SOON = 12, 4  # frames from look to look; where the last one showed a dot that may be one
 LOOKS = 3  # one after the other that show a dot before it is believed
 KEPT, MOST_BYTES = 60, 2**28  # last pictures, in which a dot is followed back, and their size together
-FREE, FAR = 0.55, 1.8  # spacings: distances on the body from known markers between which there may be another
+FREE, FAR = (
+    0.55,
+    1.8,
+)  # spacings and breadths: distances on the body from known markers between which there may be another
+BESIDE = 0.5  # sine of the angle from the line to its nearest neighbour, from which on one stands beside a marker
 SAME = 0.3  # spacings: how far on the body a dot may seem to move from look to look
 MOVING = 0.5  # px: root mean square way through the picture that shows that something moves
 CARRIED = 0.5  # of that way: how far it may move on the body the while
@@ -70,8 +74,9 @@ class Newcomers:
     recent: deque[tuple[int, NDArray, Array]] = field(default_factory=deque)
 
     def look(
-        self, number: int, image: NDArray, place: Array, seen: NDArray[np.bool_], pattern: Pattern, parameters: Array
-    ) -> list[Newcomer]:
+        self, number: int, image: NDArray, place: Array, seen: NDArray[np.bool_], marks: NDArray[np.bool_],
+        pattern: Pattern, parameters: Array,
+    ) -> list[Newcomer]:  # fmt: skip
         """Markers that have become known.
 
         Args:
@@ -79,6 +84,7 @@ class Newcomers:
             image: its picture.
             place: of the known markers [px], (M, 2).
             seen: which of them are measured, (M).
+            marks: which of them do not ride on the body, (M).
             pattern: of the known markers.
             parameters: of their discs, (M, 12).
         """
@@ -86,24 +92,25 @@ class Newcomers:
         most = KEPT if self.candidates else EVERY  # fresh memory is slow
         while len(self.recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
             self.recent.popleft()
-        if number < self.due or seen.mean() < 0.5:
+        if number < self.due or seen[~marks].mean() < 0.5:
             return []
-        found = self._strangers(image, place, pattern, parameters)
-        rest = carry(place[seen], pattern.rest[seen], found)
-        spacing = float(np.median(pattern.spacing))
-        away = np.linalg.norm(rest[:, None] - pattern.rest[None], axis=2).min(axis=1) / spacing
-        fit = (away > FREE) & (away < FAR)
+        body, spacing = seen & ~marks, float(np.median(pattern.spacing))
+        breadth = _breadth(pattern.rest[body])
+        found = self._strangers(image, place, FAR * breadth, pattern, parameters)
+        rest = carry(place[body], pattern.rest[body], found)
+        away = np.linalg.norm(rest[:, None] - pattern.rest[None], axis=2)
+        fit = (away.min(axis=1) > FREE * spacing) & (away[:, body].min(axis=1) < FAR * breadth)
         self._count(found[fit], rest[fit], number, SAME * spacing)
         self.due = number + (SOON if self.candidates else EVERY)
         ready = [item for item in self.candidates if item.carried()]
         self.candidates = [item for item in self.candidates if item not in ready]
-        followed = [self._followed_back(item, pattern, parameters, SAME * spacing) for item in ready]
+        followed = [self._followed_back(item, ~marks, pattern, parameters, SAME * spacing) for item in ready]
         return [newcomer for newcomer in followed if newcomer is not None]
 
-    def _strangers(self, image: NDArray, place: Array, pattern: Pattern, parameters: Array) -> Array:
-        """Dots of the family near the body that are no known marker's [px], (D, 2)."""
+    def _strangers(self, image: NDArray, place: Array, reach: float, pattern: Pattern, parameters: Array) -> Array:
+        """Dots of the family within reach [px] of the body that are no known marker's [px], (D, 2)."""
         spacing = float(np.median(pattern.spacing))
-        low, high = place.min(0) - FAR * spacing, place.max(0) + FAR * spacing
+        low, high = place.min(0) - reach, place.max(0) + reach
         region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         spots = find_spots(image, self.family.radius, self.family.least(self.family.contrast), region)
         away = np.linalg.norm(spots[:, None] - place[None], axis=2).min(axis=1, initial=np.inf)
@@ -130,7 +137,7 @@ class Newcomers:
             self.candidates.append(item)
 
     def _followed_back(
-        self, candidate: _Candidate, pattern: Pattern, parameters: Array, same: float
+        self, candidate: _Candidate, body: NDArray[np.bool_], pattern: Pattern, parameters: Array, same: float
     ) -> Newcomer | None:
         """The candidate in the last pictures; None where too few of those since its first look show it."""
         rest = np.median(candidate.rest, axis=0)
@@ -138,7 +145,8 @@ class Newcomers:
         shown = np.full(PARAMETERS, np.nan)
         since = 0
         for number, image, place in self.recent:
-            expected = carry(pattern.rest[: len(place)], place, rest[None])
+            riding = body[: len(place)]
+            expected = carry(pattern.rest[: len(place)][riding], place[riding], rest[None])
             near = np.argsort(np.linalg.norm(place - expected, axis=1))[:NEIGHBOURS]
             starts = np.concatenate([_starts(expected, parameters), _moved(parameters[near], place[near])])
             dots = doubted(image, fit_dots(image, starts, 1))
@@ -148,6 +156,16 @@ class Newcomers:
                 shown = dots.parameters[0]
         enough = sum(number >= candidate.since for number in seen) >= FOUND * since
         return Newcomer(rest, shown, seen) if enough and seen else None
+
+
+def _breadth(rest: Array) -> float:
+    """How far apart the markers' lines are: the usual distance to the nearest that is not in line with the nearest."""
+    way = rest[:, None] - rest[None]
+    distance = np.linalg.norm(way, axis=2) + np.where(np.eye(len(rest), dtype=bool), np.inf, 1e-9)
+    nearest = way[np.arange(len(rest)), distance.argmin(axis=1)] / distance.min(axis=1)[:, None]
+    sine = np.abs(way[..., 0] * nearest[:, None, 1] - way[..., 1] * nearest[:, None, 0]) / distance
+    beside = np.where(sine > BESIDE, distance, np.inf).min(axis=1)
+    return float(np.median(np.where(beside < np.inf, beside, distance.min(axis=1))))
 
 
 def _starts(places: Array, parameters: Array) -> Array:

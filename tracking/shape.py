@@ -24,8 +24,11 @@ GATE = 0.36  # of a marker's spacing: how far from where its neighbours put it a
 FAR = 0.12  # of a marker: what a dot one spacing from its expected place costs, where motion is known
 TURNS = np.radians([0.0, 15.0, -15.0, 30.0, -30.0, 45.0, -45.0])  # tried where the body is lost
 SEED_MARKERS, SEED_DOTS = 8, 5  # from how many markers, and how many dots of each, a match may begin
+AMBIGUOUS = 0.75  # of a marker: a match that explains less than so much less may be right as well
+QUESTIONED = 12  # dots of which it is asked whether they could be another marker's
 ROUGH = 0.5  # of a marker: what a dot at the gate's edge costs
 STILL = 0.01  # spacings: a dot that keeps its place so exactly may be a mark on the frame that holds the body
+PINNED = 0.1  # spacings: how far from its place what is known to be a mark may seem to be
 
 
 @dataclass(frozen=True)
@@ -150,17 +153,23 @@ def _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, tak
 
 
 @njit(cache=True, nogil=True)
-def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, seed, match):  # type: ignore[no-untyped-def]
-    """Spread the match of a seed, one marker and one dot; fills match (M) with dots, -1 for none.
+def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, sure, seed, match):  # type: ignore[no-untyped-def]
+    """Spread the match of a seed, one marker and one dot, and of sure ones (M), -1 for none; fills match (M) likewise.
 
     Returns the match's score; a marker counts up to 1 + steady (M) where it is expected. buckets (R, C, B): dots by
     square of side `cell` from `origin`, -1 filled.
     """
     count = shape.shape[0]
-    visited = np.zeros(count, np.bool_)
+    visited = sure >= 0
     taken = np.zeros(dots.shape[0], np.bool_)
     ready = np.zeros(count, np.int64)  # matched neighbours
-    match[:] = -1
+    match[:] = sure
+    for marker in range(count):
+        if sure[marker] >= 0:
+            taken[sure[marker]] = True
+            for k in range(neighbours.shape[1]):
+                if neighbours[marker, k] >= 0:
+                    ready[neighbours[marker, k]] += 1
     marker, found = seed[0], seed[1]
     while True:
         visited[marker] = True
@@ -204,15 +213,16 @@ def _best_growth(  # type: ignore[no-untyped-def]
     shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, seeds, enough, best
 ):  # fmt: skip
     """Tries seeds (S, 2) of marker and dot until a score reaches `enough`; fills best (M)."""
-    match = np.empty(shape.shape[0], np.int64)
+    match, nobody = np.empty(shape.shape[0], np.int64), np.full(shape.shape[0], -1)
     highest = -np.inf
     for s in range(seeds.shape[0]):
         # A pair that the best match already holds would grow into the same.
         if highest > -np.inf and best[seeds[s, 0]] == seeds[s, 1]:
             continue
         score = _grow(
-            shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, seeds[s], match
-        )
+            shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, nobody, seeds[s],
+            match,
+        )  # fmt: skip
         if score > highest:
             highest = score
             best[:] = match
@@ -221,11 +231,48 @@ def _best_growth(  # type: ignore[no-untyped-def]
     return highest
 
 
+@njit(cache=True, nogil=True)
+def _agreed(  # type: ignore[no-untyped-def]
+    shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, sure, seeds, best
+):  # fmt: skip
+    """Which markers have the same dot in best (M) and in all matches that grow from seeds and sure ones as well."""
+    agreed = best >= 0
+    match = np.empty(shape.shape[0], np.int64)
+    first = np.flatnonzero(best >= 0)[0]
+    pair = np.array([first, best[first]])
+    score = _grow(
+        shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, best, pair, match
+    )
+    for s in range(seeds.shape[0]):
+        marker, dot = seeds[s, 0], seeds[s, 1]
+        if best[marker] == dot or sure[marker] >= 0:
+            continue
+        other = _grow(
+            shape,
+            expected,
+            linear,
+            spacing,
+            neighbours,
+            dots,
+            buckets,
+            cell,
+            origin,
+            far,
+            steady,
+            sure,
+            seeds[s],
+            match,
+        )
+        if other > score - AMBIGUOUS:
+            agreed &= match == best
+    return agreed
+
+
 def recognise(
     pattern: Pattern, shape: Array, expected: Array, trusted: Array, dots: Array, reach: float, sureness: float,
-    steady: Array,
-) -> Array:  # fmt: skip
-    """The dot of each marker, (M), -1 for none.
+    steady: Array, seen: NDArray[np.bool_] | None = None, marks: NDArray[np.bool_] | None = None,
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:  # fmt: skip
+    """The dot of each marker, (M), -1 for none, and of which markers it can be no other's, (M).
 
     Args:
         pattern: the markers.
@@ -236,28 +283,51 @@ def recognise(
         reach: how far from where it is expected a seed's dot may be [spacings].
         sureness: of the expected motion as a whole, 0 to 1.
         steady: how much more a marker that is where it is expected counts than another, (M).
+        seen: which of the markers were seen in the picture before, so that there is no doubt about them, (M); all where
+            not given.
+        marks: which of the markers stand still beside the body, (M); of none that is known where not given.
     """
     nobody = np.full(len(shape), -1)
     if not len(dots):
-        return nobody
+        return nobody, np.zeros(len(shape), bool)
+    if seen is None:
+        seen = np.ones(len(shape), bool)
+    if marks is not None and marks.any():
+        match = np.where(marks, _at_place(pattern, shape, dots, PINNED), -1)
+        agreed = match >= 0
+        body, free = np.flatnonzero(~marks), np.setdiff1d(np.arange(len(dots)), match)
+        found, alone = recognise(
+            Pattern.of(pattern.rest[body]), shape[body], expected[body], trusted[body], dots[free], reach, sureness,
+            steady[body], seen[body],
+        )  # fmt: skip
+        match[body[found >= 0]] = free[found[found >= 0]]
+        agreed[body] = alone
+        return match, agreed
     search = _Search.of(pattern, dots)
     seeds = search.seeds(expected, trusted, reach)
     far = FAR * sureness
-    best, score = search.grow(shape, expected, _local_maps(pattern, shape, expected), far, steady, seeds)
-    if (best >= 0).sum() >= min(len(shape), len(dots)):
-        return best
-    # Markers and dots are left over: some may be marks beside the body, or it may stand where nobody expects it.
-    other, other_score = _with_marks(pattern, shape, expected, trusted, dots, reach, far, steady)
-    if other_score > score:
-        best, score = other, other_score
-    for turn in TURNS:
-        cos, sin = np.cos(turn), np.sin(turn)
-        linear = np.tile([[cos, -sin], [sin, cos]], (len(shape), 1, 1))
-        for base in (shape, pattern.rest):
-            other, other_score = search.grow(base, expected, linear, far, steady, seeds)
-            if other_score > score:
-                best, score = other, other_score
-    return best
+    maps = _local_maps(pattern, shape, expected)
+    best, score = search.grow(shape, expected, maps, far, steady, seeds)
+    way = shape, maps
+    if (best >= 0).sum() < min(len(shape), len(dots)):
+        # Markers and dots are left over: some may be marks beside the body, or it may stand where nobody expects it.
+        other, other_score = _with_marks(pattern, shape, expected, trusted, dots, reach, far, steady)
+        if other_score > score:
+            best, score = other, other_score
+        for turn in TURNS:
+            cos, sin = np.cos(turn), np.sin(turn)
+            linear = np.tile([[cos, -sin], [sin, cos]], (len(shape), 1, 1))
+            for base in (shape, pattern.rest):
+                other, other_score = search.grow(base, expected, linear, far, steady, seeds)
+                if other_score > score:
+                    best, score, way = other, other_score, (base, linear)
+    return best, search.agreed(*way, expected, far, steady, np.where(seen, best, -1), seeds, best)
+
+
+def _at_place(pattern: Pattern, shape: Array, dots: Array, most: float) -> NDArray[np.int64]:
+    """The dot within so many spacings of each marker's last place, (M), -1 for none."""
+    gap, nearest = cKDTree(dots).query(shape)
+    return np.where(gap < most * pattern.spacing, nearest, -1)
 
 
 def _with_marks(
@@ -265,8 +335,7 @@ def _with_marks(
     steady: Array,
 ) -> tuple[NDArray[np.int64], float]:  # fmt: skip
     """The best match (M) in which whoever can keep its place does, as marks on the frame would, and its score."""
-    gap, nearest = cKDTree(dots).query(shape)
-    match = np.where(gap < STILL * pattern.spacing, nearest, -1)
+    match = _at_place(pattern, shape, dots, STILL)
     moving, free = np.flatnonzero(match < 0), np.setdiff1d(np.arange(len(dots)), match)
     marks = len(match) - len(moving)
     if not marks or len(moving) < 2 or not len(free):  # one alone has no shape
@@ -334,12 +403,26 @@ class _Search:
     ) -> tuple[NDArray[np.int64], float]:
         """The best match (M) that grows from any seed, and its score."""
         match = np.full(len(shape), -1)
-        enough = 0.97 * min(len(shape), len(self.dots))
+        enough = 0.97 * float(np.sort(1.0 + steady)[-min(len(shape), len(self.dots)) :].sum())
         score = _best_growth(
             shape, expected, linear, self.pattern.spacing, self.pattern.neighbours, self.dots, self.buckets, self.cell,
             self.origin, far, steady, seeds, enough, match,
         )  # fmt: skip
         return match, score
+
+    def agreed(
+        self, shape: Array, linear: Array, expected: Array, far: float, steady: Array, sure: NDArray[np.int64],
+        seeds: NDArray[np.int64], best: NDArray[np.int64],
+    ) -> NDArray[np.bool_]:  # fmt: skip
+        """Which markers have their dot in every match that explains about as much and keeps the sure ones, (M)."""
+        unsure = np.setdiff1d(best, sure)
+        if not len(unsure):
+            return best >= 0
+        asked = unsure[np.linspace(0, len(unsure) - 1, min(len(unsure), QUESTIONED)).astype(int)]
+        return _agreed(
+            shape, expected, linear, self.pattern.spacing, self.pattern.neighbours, self.dots, self.buckets, self.cell,
+            self.origin, far, steady, sure, seeds[np.isin(seeds[:, 1], asked)], best,
+        )  # fmt: skip
 
 
 def _local_maps(pattern: Pattern, shape: Array, expected: Array) -> Array:

@@ -9,8 +9,9 @@ from support import picture
 
 from groundwork import InputError
 from tracking.family import find_family
-from tracking.follow import Tracker, follow
+from tracking.follow import follow
 from tracking.frame import Frame
+from tracking.tracker import Tracker
 from tracking.video import Reading
 
 SIZE = (360, 240)
@@ -139,7 +140,7 @@ def test_hidden_dots_come_back_under_their_names() -> None:
 def test_who_comes_back_into_a_curl_is_not_taken_for_its_neighbour() -> None:
     """A strip curls by up to 2.2 rad behind a screen's edge, so that returning dots come close to where others stood.
 
-    Guessed from the shape at rest, 24 places bore a neighbour's name.
+    Guessed from the shape at rest, 24 places bore a neighbour's name. A row curled on by more than was ever seen waits.
     """
     turn = 0.45 * np.sin(0.3 * np.arange(60))[:, None] * np.arange(6)
     step = 30.0 * np.stack([np.sin(turn), np.cos(turn)], axis=-1)
@@ -152,18 +153,20 @@ def test_who_comes_back_into_a_curl_is_not_taken_for_its_neighbour() -> None:
     tracks = follow(Drawn(np.where(behind[..., None], np.nan, truth)), lambda: None)  # type: ignore[arg-type]
     away = np.linalg.norm(tracks.pixel[:, order(tracks.start, truth[0])] - truth, axis=2)
     assert np.nanmax(away) < 0.5
-    assert np.isfinite(away[~behind]).mean() > 0.7
+    assert np.isfinite(away[~behind]).mean() > 0.65
 
 
-def test_two_that_come_back_together_are_told_apart_by_each_other() -> None:
-    """A third and a half of a spacing off, one nearly as near to the other's place; exchanged, both were far off."""
-    truth = np.repeat(grid()[None], 8, axis=0)
-    truth[1:4, [7, 15]] = np.nan
-    truth[4:, [7, 15], 1] -= np.array([0.53, 0.345]) * 34.0
-    tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
-    found = tracks.pixel[:, order(tracks.start, truth[0])]
-    assert np.isnan(found[1:4, [7, 15]]).all()
-    assert np.abs(found[5:] - truth[5:]).max() < 0.3  # they are looked for in every fourth frame
+def test_a_bar_that_passes_takes_no_names_with_it() -> None:
+    """It hides four of eight columns at a time of a body that swings by up to two thirds of a spacing a frame."""
+    truth = bent(grid(), 20.0 * np.sin(2 * np.pi * np.arange(60) / 7.3))
+    bar = np.linspace(-60.0, 400.0, 60)
+    behind = np.abs(truth[..., 0] - bar[:, None]) < 60.0
+    assert behind.sum(axis=1).max() == 12
+    tracks = follow(Drawn(np.where(behind[..., None], np.nan, truth)), lambda: None)  # type: ignore[arg-type]
+    away = np.linalg.norm(tracks.pixel[:, order(tracks.start, truth[0])] - truth, axis=2)
+    assert np.nanmax(away) < 0.3
+    assert np.isfinite(away[~behind]).mean() > 0.99
+    assert np.isfinite(away[-1]).all()
 
 
 def test_dots_hidden_at_first_are_taken_in() -> None:
@@ -179,6 +182,20 @@ def test_dots_hidden_at_first_are_taken_in() -> None:
     found = tracks.pixel[:, match]
     assert np.isnan(found[:15, :3]).all()
     assert np.abs(found[15:] - truth[15:]).max() < 0.3
+
+
+def test_hidden_columns_far_apart_are_taken_in() -> None:
+    """Three rows, two and a half times as far from column to column as from row to row; the last two columns hide."""
+    rest = grid(5, 3) * [1.6, 0.64] - [24.0, -30.0]
+    truth = bent(rest, np.concatenate([np.zeros(15), 20.0 * np.sin(2 * np.pi * np.arange(85) / 16)]))
+    places = truth.copy()
+    places[:15, rest[:, 0] > 180.0] = np.nan
+    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 6
+    match = order(tracks.start, truth[0])
+    assert sorted(match) == list(range(15))
+    assert np.nanmax(np.linalg.norm(tracks.pixel[:, match] - truth, axis=2)) < 0.3
+    assert np.isfinite(tracks.pixel[60:]).all()
 
 
 @pytest.mark.parametrize("period", [10, 35, 160])

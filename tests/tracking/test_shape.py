@@ -28,7 +28,7 @@ def test_moves_of_more_than_a_spacing(angle: float, random: np.random.Generator)
     before, after = bent(grid(), 0.1), bent(grid(), 0.1 + angle)
     assert np.linalg.norm(after - before, axis=1).max() > 38
     mixed = random.permutation(27)
-    match = recognise(Pattern.of(before), before, before, np.zeros(27), after[mixed], 2.2, 0.3, np.zeros(27))
+    match, _ = recognise(Pattern.of(before), before, before, np.zeros(27), after[mixed], 2.2, 0.3, np.zeros(27))
     np.testing.assert_array_equal(mixed[match], np.arange(27))
 
 
@@ -36,7 +36,7 @@ def test_hidden_dots_and_false_ones(random: np.random.Generator) -> None:
     before, after = bent(grid(), 0.0), bent(grid(), 0.25)
     shown = np.delete(np.arange(27), [3, 4, 12, 13, 21])
     dots = np.concatenate([after[shown], [[150.0, 200.0], [300.0, 420.0]]])
-    match = recognise(Pattern.of(before), before, before, np.zeros(27), dots, 2.2, 0.3, np.zeros(27))
+    match, _ = recognise(Pattern.of(before), before, before, np.zeros(27), dots, 2.2, 0.3, np.zeros(27))
     np.testing.assert_array_equal(np.flatnonzero(match < 0), [3, 4, 12, 13, 21])
     np.testing.assert_array_equal(shown[match[match >= 0]], np.flatnonzero(match >= 0))
 
@@ -46,7 +46,7 @@ def test_all_but_a_few_keep_still(away: int) -> None:
     """Only what is beside the body's end has moved, to where none of it can be: nobody takes another's dot."""
     dots = grid()
     dots[:away] += [0.0, 700.0]
-    match = recognise(Pattern.of(grid()), grid(), grid(), np.zeros(27), dots, 2.2, 1.0, np.zeros(27))
+    match, _ = recognise(Pattern.of(grid()), grid(), grid(), np.zeros(27), dots, 2.2, 1.0, np.zeros(27))
     np.testing.assert_array_equal(match[away:], np.arange(away, 27))
     assert (match[:away] < 0).all()
 
@@ -66,7 +66,7 @@ def test_who_is_in_sight_keeps_its_place_when_others_come_back() -> None:
     """
     believed, dots = curled(0.5), curled(0.8)[:12]
     seen = np.arange(18) < 6
-    match = recognise(
+    match, _ = recognise(
         Pattern.of(curled(0.0)), believed, believed, np.where(seen, 0.0, -5.0), dots, 2.2, 1.0, np.where(seen, 1.0, 0.0)
     )
     np.testing.assert_array_equal(match[:6], np.arange(6))

@@ -1,0 +1,53 @@
+"""Dots that keep still while the body beside them moves: marks on the frame, screws, letters' holes.
+
+They look like markers, but where the body is they do not tell.
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tracking.memory import Memory
+from tracking.shape import Pattern
+
+Array = NDArray[Any]
+
+STILL = 0.05  # spacings: who never was farther from its first place may be a mark
+LEFT_BEHIND, BEYOND_DOUBT = 0.5, 4.0  # spacings and standard deviations: who keeps still so far from where the others
+# would carry it is one
+FARTHER = 1.1  # times as far as at the last look the body must have gone, for another look
+FEWEST = 4  # moving markers that carry others
+
+
+class Marks:
+    """Which of a recording's markers are marks, as far as the motion has shown.
+
+    Attributes:
+        known: (M).
+    """
+
+    def __init__(self, count: int) -> None:
+        self.known = np.zeros(count, bool)
+        self._way = np.zeros(count)  # the farthest that each was from its first place [spacings]
+        self._looked = LEFT_BEHIND / FARTHER  # how far the body had gone then [spacings]
+
+    def look(self, place: Array, seen: NDArray[np.bool_], pattern: Pattern) -> None:
+        """At the places [px], (M, 2), of the markers seen (M) in the next picture."""
+        away = np.where(seen, np.hypot(*(place - pattern.rest).T) / pattern.spacing, 0.0)
+        self._way = np.maximum(self._way, away)
+        still = self._way < STILL
+        self.known &= still
+        farthest = away.max(initial=0.0)
+        if farthest < FARTHER * self._looked:
+            return
+        self._looked = farthest
+        still, moving = seen & still, seen & ~still
+        if still.any() and moving.sum() >= FEWEST:
+            belief = Memory(pattern.rest).carried(place, moving)
+            left = np.hypot(*(belief.place - pattern.rest).T)
+            self.known |= still & (left > LEFT_BEHIND * pattern.spacing) & (left > BEYOND_DOUBT * belief.sigma)
+
+    def join(self) -> None:
+        """One more marker, which moves."""
+        self.known, self._way = np.append(self.known, False), np.append(self._way, 1.0)
