@@ -23,10 +23,8 @@ Array = NDArray[Any]
 EVERY, SOON = 12, 4  # frames from look to look; where the last one showed a dot that may be one
 LOOKS = 3  # one after the other that show a dot before it is believed
 KEPT, MOST_BYTES = 60, 2**28  # last pictures, in which a dot is followed back, and their size together
-FREE, FAR = (
-    0.55,
-    1.8,
-)  # spacings and breadths: distances on the body from known markers between which there may be another
+FREE = 0.55  # spacings: how far on the body from known markers there may be another
+FAR = 1.8  # breadths: how far from them at most
 BESIDE = 0.5  # sine of the angle from the line to its nearest neighbour, from which on one stands beside a marker
 SAME = 0.3  # spacings: how far on the body a dot may seem to move from look to look
 MOVING = 0.5  # px: root mean square way through the picture that shows that something moves
