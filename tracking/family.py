@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from tracking.dots import (
     LEAST_CONTRAST,
@@ -21,6 +22,8 @@ from tracking.dots import (
 
 SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
+STRANGE = 4.5  # likewise, though it stands where the family's rows go on: under a gloss a dot hardly looks like one
+AROUND, IN_LINE, LINES = 8, 0.12, 3  # nearest members, of their distance, and how many lines it then must stand in
 DIM, DIMMEST = 0.3, 0.15  # of the usual contrast; between them a dot must keep back as large a share of the light
 BLACKEST = 1.25  # shade: a dot that seems to keep back more than all light is none
 SPOT_SHARE, SPOT_LEAST = 0.3, 0.5  # of the usual and of the dimmest marker's contrast: what a spot must stand out by
@@ -92,8 +95,11 @@ def _usual(figure: NDArray, quality: NDArray) -> float:
     return float(figure[order[np.searchsorted(counted, 0.5 * counted[-1])]])
 
 
-def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
-    """Which are like the usual in size, contrast, fit, sigma and blur taken together: a blot is a little off in all."""
+def _unlike(dots: Dots, usual: Dots) -> NDArray:
+    """How they differ from the usual in size, contrast, fit, sigma and blur taken together, in usual differences, (D).
+
+    A blot is a little off in all.
+    """
     quality, vague = _quality(usual), np.minimum(dots.vague, VAGUEST)
     unlike = np.log(dots.radius / _usual(usual.radius, quality)) ** 2 / (0.12**2 + vague**2)
     contrast = np.log(dots.contrast / _usual(usual.contrast, quality))
@@ -108,7 +114,18 @@ def _are_kin(dots: Dots, usual: Dots) -> NDArray[np.bool_]:
     sigma, blur = _usual(usual.sigma.max(axis=1), quality), _usual(usual.blur, quality)
     unlike += np.maximum(np.log(dots.sigma.max(axis=1) / max(sigma, 0.01)) / 0.55, 0.0) ** 2
     unlike += np.maximum(np.log(dots.blur / max(blur, 0.5)) / 0.45, 0.0) ** 2
-    return (unlike < UNLIKE**2) & (dots.shade < BLACKEST + 2.0 * vague)
+    return np.where(dots.shade < BLACKEST + 2.0 * vague, np.sqrt(unlike), np.inf)
+
+
+def _lines(place: NDArray, members: NDArray) -> int:
+    """In how many lines with two of the members (M, 2) a place (2) stands, as far apart, between or next to them."""
+    way = members - place
+    distance = np.linalg.norm(way, axis=1)
+    near = np.argsort(distance)[:AROUND]
+    tree = cKDTree(members)
+    next_after, between = place + 2.0 * way[near], place - way[near]
+    in_line = [tree.query(end)[0] < IN_LINE * distance[near] for end in (next_after, between)]
+    return int(in_line[0].sum() + in_line[1].sum() // 2)
 
 
 def find_family(image: NDArray) -> tuple[Family, Dots] | None:
@@ -126,7 +143,7 @@ def find_family(image: NDArray) -> tuple[Family, Dots] | None:
             score = float(quality[alike].sum())
             if best is None or score > best[0]:
                 members = dots[alike]
-                members = members[_are_kin(members, members)]
+                members = members[_unlike(members, members) < UNLIKE]
                 best = (score, Family.of(dark, members), members, start)
     return None if best is None else (best[1], _with_relatives(image, *best[1:]))
 
@@ -139,5 +156,11 @@ def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArra
     anew = fit_dots(image, np.concatenate([members.parameters, left]))
     first, more = anew[: len(members)], anew[len(members) :]
     good, more = family.admits(first), more[family.admits(more)]
-    more = more[_are_kin(more, members)]
-    return apart(first[good].beside(members[~good]).beside(more), SAME_PLACE * family.radius)
+    unlike = _unlike(more, members)
+    kin, before = unlike < UNLIKE, -1
+    while kin.sum() > before:  # each that is found lengthens lines
+        before = int(kin.sum())
+        known = np.concatenate([members.centre, more.centre[kin]])
+        lines = np.array([_lines(place, known) for place in more.centre], int)
+        kin |= (lines >= LINES) & (unlike < STRANGE)
+    return apart(first[good].beside(members[~good]).beside(more[kin]), SAME_PLACE * family.radius)

@@ -264,6 +264,20 @@ def test_stains_of_the_skin_are_no_markers() -> None:
     assert false <= 4
 
 
+@pytest.mark.parametrize("row", [80, 114, 182])
+@pytest.mark.parametrize("beside", [-6.0, 6.0])
+def test_markers_under_a_gloss_stand_in_the_others_rows(row: int, beside: float) -> None:
+    """A streak of light as wide as a dot runs along a row, two thirds as bright as the dots are dark."""
+    rest = grid(8, 4)
+    image = picture([(x, y, 6.0, 6.0, 0.0) for x, y in rest], (360, 260), noise=2.0)
+    streak = 90.0 * np.exp(-(((np.arange(260)[:, None] - row - beside) / 9.0) ** 2))
+    found = find_family(np.clip(np.rint(image + streak), 0, 255).astype(np.uint8))
+    assert found is not None
+    away = np.linalg.norm(found[1].centre[:, None] - rest, axis=2)
+    assert away.min(axis=1).max() < 1.0
+    assert (away.min(axis=0) < 1.0).sum() >= 31
+
+
 def test_too_few_dots_are_refused() -> None:
     with pytest.raises(InputError, match=r"drawn\.mp4: expected at least 3 dots .* found 2"):
         follow(Drawn(grid(2, 1)[None]), lambda: None)  # type: ignore[arg-type]
