@@ -123,9 +123,11 @@ class Memory:
         Returns:
             The known ones at their position, with a sigma of 0.
         """
+        if known.all():
+            return Belief(position.copy(), np.zeros(len(known)))
         place, weight = np.where(known[:, None], position, self._rest), known.astype(float)
         if guess is not None:
-            unsure = max((~known).sum(), 1) * guess.sigma**2
+            unsure = (~known).sum() * guess.sigma**2
             weight = np.where(known, 1.0, self._error**2 / (self._error**2 + unsure))  # as if of a known one's error
             place = np.where(known[:, None] | (weight == 0.0)[:, None], place, guess.place)
         told, hidden = np.repeat(weight, 2), np.repeat(~known, 2)
