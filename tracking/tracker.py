@@ -21,6 +21,7 @@ from tracking.marks import Marks
 from tracking.memory import Belief, Memory
 from tracking.motion import Motion
 from tracking.newcomers import Newcomer, Newcomers
+from tracking.outlines import Outlines
 from tracking.recall import recalled, unmistakable
 from tracking.shape import Pattern, recognise
 
@@ -53,6 +54,7 @@ class Tracker:
         self.searched = 0  # frames since the last search
         self.newcomers = Newcomers(family)
         self.looks = WholeLooks.none(len(first))
+        self.outlines = Outlines(first)
 
     def advance(self, image: NDArray) -> Dots:
         """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
@@ -77,7 +79,7 @@ class Tracker:
             dots = _only(dots, self._undisputed(dots, agreed, guess))
         dots = self.looks.judge(image, dots)
         self._learn(dots, agreed, guess)
-        return dots
+        return self.outlines.judge(dots, self.pattern.rest)
 
     def pass_over(self) -> None:
         """A frame that shows nothing."""
@@ -102,6 +104,7 @@ class Tracker:
             self.memory = self.memory.join(newcomer.rest)
             self.marks.join()
             self.looks.join()
+            self.outlines.join()
             self.pattern = Pattern.of(np.concatenate([rest, newcomer.rest[None]]))
             self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
             self.missing = np.append(self.missing, 0 if number in newcomer.seen else 1)
