@@ -103,6 +103,7 @@ def hiding(random: np.random.Generator, quick: bool) -> Iterator[Row]:
         ("all hidden 10 frames", 50),
         ("leaving and entering", 120),
         ("a third hidden for the first 30 frames", 120),
+        ("a bar of 2.4 spacings passes", 100),
     ):
         results = []
         for k in range(count):
@@ -119,7 +120,9 @@ def hiding(random: np.random.Generator, quick: bool) -> Iterator[Row]:
                 hidden[:30, np.argsort(beam.centres[0] @ random.normal(size=2))[: dots // 3]] = True
             else:
                 across = beam.centres[:, :, 0]
-                hidden = across > np.quantile(across, 0.7)
+                bar = np.linspace(across.min() - 60.0, across.max() + 60.0, frames)[:, None]
+                passing = np.abs(across - bar) < 1.2 * beam.spacing
+                hidden = passing if case.endswith("passes") else across > np.quantile(across, 0.7)
                 hidden[0] = False
             results.append(judge(Drawn(beam, random.uniform(2, 6), k, hidden)))
         yield Row("recordings with a wrong identity", case, sum(item.wrong > 0 for item in results), "0")
