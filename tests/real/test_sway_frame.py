@@ -1,11 +1,18 @@
 """A model frame swayed by hand: 28 dots, 160 pictures, one camera."""
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import h5py
 import numpy as np
 import pytest
 from support import SHARED, Run
+
+from tracking.follow import follow
+from tracking.frame import Frame
+from tracking.video import Reading
 
 FOLDER = SHARED / "real" / "sway_frame"
 pytestmark = [
@@ -49,3 +56,42 @@ def test_every_dot_is_followed(run: Run, tmp_path: Path) -> None:
     assert min(np.corrcoef(even[:, row], odd[:, row])[0, 1] for row in range(4)) > 0.85
     noise = np.sqrt(7 / 6) * (moves - moves.mean(axis=2, keepdims=True)).std(axis=0)
     assert np.median(noise) < 0.02
+
+
+@dataclass(frozen=True)
+class Barred:
+    """Stands in for the video: its pictures, from the second on with a grey bar painted over them, if any."""
+
+    bars: tuple[tuple[slice, slice], ...] = ()  # by picture
+    path: Path = FOLDER
+
+    def read(self) -> Reading:
+        return Reading(self.frames())
+
+    def frames(self) -> Iterator[Frame]:
+        for number, path in enumerate(sorted(FOLDER.glob("*.jpg"))):
+            picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            assert picture is not None
+            if number and self.bars:
+                picture[self.bars[number]] = 120
+            yield Frame(number / 22.7, picture)
+
+
+@pytest.mark.parametrize("down", [False, True])
+def test_a_bar_that_passes_takes_no_names_with_it(down: bool) -> None:
+    """It hides two of seven columns or one of four rows at a time; where it cuts a dot, sigma says so."""
+    free = follow(Barred(), lambda: None)  # type: ignore[arg-type]
+    ends, half = ((0, 2046), 260) if down else ((-200, 1500), 200)
+    middle = np.linspace(*ends, 160).astype(int)
+    bars = [slice(max(at - half, 0), max(at + half, 0)) for at in middle]
+    everywhere = slice(None)
+    video = Barred(tuple((bar, everywhere) if down else (everywhere, bar) for bar in bars))
+    tracks = follow(video, lambda: None)  # type: ignore[arg-type]
+    order = np.linalg.norm(free.start[:, None] - tracks.start, axis=2).argmin(axis=1)
+    assert sorted(order) == list(range(28))
+    error = np.abs(tracks.pixel[:, order] - free.pixel)
+    sure = np.maximum(0.3, 5.0 * tracks.sigma[:, order])
+    assert not (error > sure).any()
+    behind = np.abs(free.pixel[..., int(down)] - middle[:, None]) < half + 15
+    behind[0] = False
+    assert np.isfinite(error[~behind]).mean() > 0.995
