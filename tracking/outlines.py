@@ -16,13 +16,10 @@ from tracking.dots import Dots
 Array = NDArray[Any]
 
 LEAST = 0.025  # of an outline's half width: what is less is neither lost nor gained
-VAGUE, UNSURE, SCATTERED = (
-    4.0,
-    4.0,
-    5.0,
-)  # standard deviations of the radius, of the centre, and of changes so far: same
+VAGUE, UNSURE = 4.0, 4.0  # standard deviations of the radius, and of the centre: likewise
+SCATTERED = 5.0  # standard deviations of what it lost or gained so far: likewise
 MOST = 0.1  # of a half width: of what lost or gained more, not much can be said
-SCATTER, UNUSUAL = 0.01, 2.5  # by which half widths change, at first; so many times that is no scatter
+SCATTER, UNUSUAL = 0.01, 2.5  # of a half width: what it is at first; standard deviations that are counted at most
 LOOKS = 5  # at a marker before it is judged
 USED_TO, STILL_HIDDEN = 0.1, 0.03  # of a change: how much of it is taken for usual, and while a part seems hidden
 OBLIQUE = 1.5  # of what is lost or gained along an axis: how far the centre may be off along it
@@ -47,7 +44,8 @@ class Outlines:
             rest: where these are at rest [px], (M, 2).
         """
         seen = np.isfinite(dots.sigma[:, 0])
-        widths = np.where(seen[:, None], _half_widths(dots.parameters), np.nan)
+        widths = np.full((len(dots), 2), np.nan)
+        widths[seen] = _half_widths(dots.parameters[seen])
         change = widths - self._usual
         least = np.maximum(VAGUE * dots.vague[:, None], UNSURE * dots.sigma / np.exp(widths))
         least = np.fmax(np.maximum(LEAST, SCATTERED * self._scatter), least)
