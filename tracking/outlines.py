@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from tracking.dots import Dots
@@ -43,21 +44,19 @@ class Outlines:
             dots: of the markers, (M).
             rest: where these are at rest [px], (M, 2).
         """
-        seen = np.isfinite(dots.sigma[:, 0])
-        widths = np.full((len(dots), 2), np.nan)
-        widths[seen] = _half_widths(dots.parameters[seen])
-        change = widths - self._usual
-        least = np.maximum(VAGUE * dots.vague[:, None], UNSURE * dots.sigma / np.exp(widths))
-        least = np.fmax(np.maximum(LEAST, SCATTERED * self._scatter), least)
-        own = change
-        if (np.abs(change) > least).any():
+        widths, change, least = np.empty((3, len(dots), 2))
+        alike = _compare(
+            dots.parameters, dots.sigma, dots.vague, self._usual, self._scatter, widths, change, least,
+        )  # fmt: skip
+        own, hidden = change, np.zeros(len(dots), bool)
+        if not alike:
             known = np.isfinite(change[:, 0])
             own = change - np.stack([_shared(rest, change[:, k], known) for k in range(2)], axis=1)
-        hidden = (np.abs(own) > least).any(axis=1) & (self._looks >= LOOKS)
-        lost = np.where(hidden[:, None], OBLIQUE * np.exp(widths) * np.expm1(np.abs(own)), 0.0)
-        self._learn(widths, change, own, seen & ~hidden)
+            hidden = (np.abs(own) > least).any(axis=1) & (self._looks >= LOOKS)
+        _learn(widths, change, own, hidden, self._usual, self._scatter, self._looks)
         if not hidden.any():
             return dots
+        lost = np.where(hidden[:, None], OBLIQUE * np.exp(widths) * np.expm1(np.abs(own)), 0.0)
         good = ~hidden | (np.abs(own) < MOST).all(axis=1)
         return replace(dots, sigma=np.where(good[:, None], np.hypot(dots.sigma, lost), np.nan))
 
@@ -67,24 +66,59 @@ class Outlines:
         self._scatter = np.concatenate([self._scatter, np.full((1, 2), SCATTER)])
         self._looks = np.append(self._looks, 0.0)
 
-    def _learn(self, widths: Array, change: Array, own: Array, whole: NDArray[np.bool_]) -> None:
-        known, new = np.isfinite(change[:, 0]), whole & np.isnan(self._usual[:, 0])
-        both, hidden = known & whole, known & ~whole
-        self._looks += whole
-        if both.any():  # who is not seen whole changes as the others do
-            self._usual[~both] += USED_TO * np.median(change[both], axis=0)
-        self._usual[both] += np.maximum(USED_TO, 1.0 / self._looks[both, None]) * change[both]
-        self._usual[hidden] += STILL_HIDDEN * change[hidden]
-        self._usual[new] = widths[new]
-        variance = self._scatter[both] ** 2
-        usual = np.minimum(own[both] ** 2, UNUSUAL**2 * variance)
-        self._scatter[both] = np.sqrt(variance + USED_TO * (usual - variance))
 
-
-def _half_widths(parameters: Array) -> Array:
+@njit(cache=True, error_model="numpy")
+def _half_widths(parameters):  # type: ignore[no-untyped-def]
     """Logarithms of half widths along x and y of discs (D, 12), (D, 2)."""
-    a, b, c = parameters[:, 2:5].T
-    return np.log(np.stack([np.hypot(b, c), np.hypot(a, b)], axis=1) / np.abs(a * c - b * b)[:, None])
+    widths = np.empty((len(parameters), 2))
+    for k in range(len(parameters)):
+        a, b, c = parameters[k, 2], parameters[k, 3], parameters[k, 4]
+        determinant = abs(a * c - b * b)
+        widths[k, 0], widths[k, 1] = np.log(np.hypot(b, c) / determinant), np.log(np.hypot(a, b) / determinant)
+    return widths
+
+
+@njit(cache=True)
+def _compare(parameters, sigma, vague, usual, scatter, widths, change, least):  # type: ignore[no-untyped-def]
+    """Fills the half widths, their changes and what change is least counted, (M, 2), NaN where a dot is not seen.
+
+    Returns whether none changed by more.
+    """
+    widths[:], change[:], least[:] = np.nan, np.nan, np.nan
+    alike = True
+    for k in range(len(sigma)):
+        if sigma[k, 0] == sigma[k, 0]:
+            widths[k] = _half_widths(parameters[k : k + 1])[0]
+            for axis in range(2):
+                unsure = max(VAGUE * vague[k], UNSURE * sigma[k, axis] / np.exp(widths[k, axis]))
+                least[k, axis] = max(LEAST, SCATTERED * scatter[k, axis], unsure)
+                change[k, axis] = widths[k, axis] - usual[k, axis]
+                alike = alike and not abs(change[k, axis]) > least[k, axis]
+    return alike
+
+
+@njit(cache=True)
+def _learn(widths, change, own, hidden, usual, scatter, looks):  # type: ignore[no-untyped-def]
+    """Takes a picture's changes (M, 2), as they are and but for what all share, into what is usual."""
+    known = change[:, 0] == change[:, 0]
+    both = known & ~hidden
+    common = np.zeros(2)
+    if both.any():  # who is not seen whole changes as the others do
+        common[0], common[1] = np.median(change[both, 0]), np.median(change[both, 1])
+    for k in range(len(usual)):
+        looks[k] += widths[k, 0] == widths[k, 0] and not hidden[k]
+        for axis in range(2):
+            if both[k]:
+                usual[k, axis] += max(USED_TO, 1.0 / looks[k]) * change[k, axis]
+                variance = scatter[k, axis] ** 2
+                counted = min(own[k, axis] ** 2, UNUSUAL**2 * variance)
+                scatter[k, axis] = np.sqrt(variance + USED_TO * (counted - variance))
+            elif known[k]:
+                usual[k, axis] += USED_TO * common[axis] + STILL_HIDDEN * change[k, axis]
+            elif widths[k, axis] == widths[k, axis]:
+                usual[k, axis] = widths[k, axis]
+            else:
+                usual[k, axis] += USED_TO * common[axis]
 
 
 def _shared(rest: Array, change: Array, known: NDArray[np.bool_]) -> Array:
