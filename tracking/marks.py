@@ -6,6 +6,7 @@ They look like markers, but where the body is they do not tell.
 from typing import Any
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 
 from tracking.memory import Memory
@@ -34,11 +35,11 @@ class Marks:
 
     def look(self, place: Array, seen: NDArray[np.bool_], pattern: Pattern) -> None:
         """At the places [px], (M, 2), of the markers seen (M) in the next picture."""
-        away = np.where(seen, np.hypot(*(place - pattern.rest).T) / pattern.spacing, 0.0)
-        self._way = np.maximum(self._way, away)
+        farthest = _go(place, seen, pattern.rest, pattern.spacing, self._way)
+        if farthest < FARTHER * self._looked and not self.known.any():
+            return
         still = self._way < STILL
         self.known &= still
-        farthest = away.max(initial=0.0)
         if farthest < FARTHER * self._looked:
             return
         self._looked = farthest
@@ -51,3 +52,15 @@ class Marks:
     def join(self) -> None:
         """One more marker, which moves."""
         self.known, self._way = np.append(self.known, False), np.append(self._way, 1.0)
+
+
+@njit(cache=True)
+def _go(place, seen, rest, spacing, way):  # type: ignore[no-untyped-def]
+    """The farthest that a marker is from its first place [spacings]; way (M) becomes at least what each one's is."""
+    farthest = 0.0
+    for k in range(len(seen)):
+        if seen[k]:
+            away = np.hypot(place[k, 0] - rest[k, 0], place[k, 1] - rest[k, 1]) / spacing[k]
+            way[k] = max(way[k], away)
+            farthest = max(farthest, away)
+    return farthest

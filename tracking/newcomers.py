@@ -90,7 +90,7 @@ class Newcomers:
         most = KEPT if self.candidates else EVERY  # fresh memory is slow
         while len(self.recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
             self.recent.popleft()
-        if number < self.due or seen[~marks].mean() < 0.5:
+        if number < self.due or 2 * (seen & ~marks).sum() < (~marks).sum():
             return []
         body, spacing = seen & ~marks, float(np.median(pattern.spacing))
         breadth = _breadth(pattern.rest[body])

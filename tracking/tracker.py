@@ -246,7 +246,7 @@ class Tracker:
         self.doubt = doubt
         self.marks.look(place, seen, self.pattern)
         body = ~self.marks.known
-        if seen[body].mean() > 0.5:
+        if 2 * (seen & body).sum() > body.sum():
             self.memory.add(self.memory.carried(place, seen & body).place, seen)
         if back.any() and not (seen & self._seen()).any():
             self.motion.forget()
