@@ -59,9 +59,9 @@ class Tracker:
     def advance(self, image: NDArray) -> Dots:
         """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
         guess = self._guess()
-        followed = self._seen() & (self.doubt == 0.0)
-        needless = (followed | self.marks.known).all()
-        expected = guess.place if needless else self._carried(guess.place, followed, guess).place
+        followed, expected = self._seen() & (self.doubt == 0.0), guess.place
+        if not (followed | self.marks.known).all():
+            expected = self._carried(expected, followed, guess).place
         dots, agreed = None, np.zeros(len(expected), bool)
         if self.motion.surprise.min() < CALM:
             dots = self._where_expected(image, expected)
@@ -124,8 +124,9 @@ class Tracker:
     def _guess(self) -> Belief:
         """Where the markers' own motion so far puts them."""
         surprise = min(float(self.motion.surprise.min()), 1.0) * self.pattern.spacing
-        spread = np.hypot(STRAYING * self.doubt, surprise)
-        return Belief(self.motion.expected(), np.where(self.missing <= FRESH, spread, np.inf))
+        if self.doubt.any():
+            surprise = np.where(self.missing <= FRESH, np.hypot(STRAYING * self.doubt, surprise), np.inf)
+        return Belief(self.motion.expected(), surprise)
 
     def _seen(self) -> NDArray[np.bool_]:
         """Which markers of the body were in sight."""
@@ -237,18 +238,20 @@ class Tracker:
 
     def _learn(self, dots: Dots, agreed: NDArray[np.bool_], guess: Belief) -> None:
         seen, place = np.isfinite(dots.sigma[:, 0]), dots.centre
-        self.motion.judge(place, seen & self._seen(), self.pattern.spacing)
+        followed = seen & self._seen()
+        self.motion.judge(place, followed, self.pattern.spacing)
         back = seen & (self.missing > 0)
-        doubt = np.where(back & ~agreed, np.minimum(self.doubt, self.pattern.spacing), 0.0)
-        if not seen.all():
+        if seen.all() and not back.any():
+            self.doubt[:] = 0.0
+        else:
+            doubt = np.where(back & ~agreed, np.minimum(self.doubt, self.pattern.spacing), 0.0)
             place, sigma = self._carried(place, seen, guess)
-            doubt[~seen] = sigma[~seen]
-        self.doubt = doubt
+            self.doubt = np.where(seen, doubt, sigma)
         self.marks.look(place, seen, self.pattern)
         body = ~self.marks.known
         if 2 * (seen & body).sum() > body.sum():
             self.memory.add(self.memory.carried(place, seen & body).place, seen)
-        if back.any() and not (seen & self._seen()).any():
+        if back.any() and not followed.any():
             self.motion.forget()
         self.motion.remember(place, back)
         self.missing = np.where(seen, 0, self.missing + 1)
