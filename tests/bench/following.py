@@ -110,19 +110,20 @@ def hiding(random: np.random.Generator, quick: bool) -> Iterator[Row]:
             beam = random_beam(random, frames, random.uniform(0.3, 1.0))
             dots = beam.centres.shape[1]
             hidden = np.zeros((frames, dots), bool)
-            if case.startswith("a third"):
-                side = beam.centres[0] @ random.normal(size=2)
-                order = np.argsort(side) if k % 2 else random.permutation(dots)
-                hidden[20:120, order[: dots // 3]] = True
-            elif case.startswith("all"):
+            side = np.argsort(beam.centres[0] @ random.normal(size=2))[: dots // 3]
+            across = beam.centres[:, :, 0]
+            if case == "a third hidden 100 frames":
+                hidden[20:120, side if k % 2 else random.permutation(dots)[: dots // 3]] = True
+            elif case == "a third hidden for the first 30 frames":
+                hidden[:30, side] = True
+            elif case == "all hidden 10 frames":
                 hidden[20:30] = True
-            elif case.endswith("first 30 frames"):
-                hidden[:30, np.argsort(beam.centres[0] @ random.normal(size=2))[: dots // 3]] = True
+            elif case == "leaving and entering":
+                hidden = across > np.quantile(across, 0.7)
+                hidden[0] = False
             else:
-                across = beam.centres[:, :, 0]
                 bar = np.linspace(across.min() - 60.0, across.max() + 60.0, frames)[:, None]
-                passing = np.abs(across - bar) < 1.2 * beam.spacing
-                hidden = passing if case.endswith("passes") else across > np.quantile(across, 0.7)
+                hidden = np.abs(across - bar) < 1.2 * beam.spacing
                 hidden[0] = False
             results.append(judge(Drawn(beam, random.uniform(2, 6), k, hidden)))
         yield Row("recordings with a wrong identity", case, sum(item.wrong > 0 for item in results), "0")
