@@ -15,8 +15,8 @@ from tracking.shape import Pattern
 Array = NDArray[Any]
 
 STILL = 0.05  # spacings: who never was farther from its first place may be a mark
-LEFT_BEHIND, BEYOND_DOUBT = 0.5, 4.0  # spacings and standard deviations: who keeps still so far from where the others
-# would carry it is one
+LEFT_BEHIND = 0.5  # spacings: who keeps still so far from where the others would carry it is one
+BEYOND_DOUBT = 4.0  # standard deviations: likewise
 FARTHER = 1.3  # times as far as at the last look the body must have gone, for another look
 FEWEST = 4  # moving markers that carry others
 

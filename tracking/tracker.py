@@ -242,7 +242,7 @@ class Tracker:
         self.motion.judge(place, followed, self.pattern.spacing)
         back = seen & (self.missing > 0)
         if seen.all() and not back.any():
-            self.doubt[:] = 0.0
+            self.doubt = np.zeros(len(seen))
         else:
             doubt = np.where(back & ~agreed, np.minimum(self.doubt, self.pattern.spacing), 0.0)
             place, sigma = self._carried(place, seen, guess)
