@@ -117,14 +117,17 @@ def _unlike(dots: Dots, usual: Dots) -> NDArray:
     return np.where(dots.shade < BLACKEST + 2.0 * vague, np.sqrt(unlike), np.inf)
 
 
-def _lines(place: NDArray, members: NDArray) -> int:
-    """In how many lines with two of the members (M, 2) a place (2) stands, as far apart, between or next to them."""
+def lines_through(place: NDArray, members: NDArray, most: float = np.inf) -> int:
+    """In how many lines with two of the members (M, 2) a place (2) stands, as far apart, between or next to them.
+
+    It may be beside these by `IN_LINE` of their distance, and by so much at most [px].
+    """
     way = members - place
     distance = np.linalg.norm(way, axis=1)
     near = np.argsort(distance)[:AROUND]
+    beside = np.minimum(IN_LINE * distance[near], most)
     tree = cKDTree(members)
-    next_after, between = place + 2.0 * way[near], place - way[near]
-    in_line = [tree.query(end)[0] < IN_LINE * distance[near] for end in (next_after, between)]
+    in_line = [tree.query(end)[0] < beside for end in (place + 2.0 * way[near], place - way[near])]
     return int(in_line[0].sum() + in_line[1].sum() // 2)
 
 
@@ -161,6 +164,6 @@ def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArra
     while kin.sum() > before:  # each that is found lengthens lines
         before = int(kin.sum())
         known = np.concatenate([members.centre, more.centre[kin]])
-        lines = np.array([_lines(place, known) for place in more.centre], int)
+        lines = np.array([lines_through(place, known) for place in more.centre], int)
         kin |= (lines >= LINES) & (unlike < STRANGE)
     return apart(first[good].beside(members[~good]).beside(more[kin]), SAME_PLACE * family.radius)

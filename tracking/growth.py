@@ -8,8 +8,7 @@ motion's linear part (M, 2, 2), their spacing (M) and neighbours (M, K), and the
 import numpy as np
 from numba import njit
 
-from tracking.affine import STIFFNESS
-
+STIFFNESS = 0.04  # of neighbours' own spread: how firmly local maps hold on to the expected one
 GATE = 0.36  # of a marker's spacing: how far from where its neighbours put it a dot may be
 ROUGH = 0.5  # of a marker: what a dot at the gate's edge costs
 AMBIGUOUS = 0.75  # of a marker: a match that explains less than so much less may be right as well

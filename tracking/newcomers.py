@@ -1,50 +1,42 @@
 """Markers that come into sight after the first frame: from behind a hand, or from outside the picture.
 
 A dot is taken in once it moves, in one look after the other, and stays in its place on the body the while; and where
-the last pictures show it there nearly always. What stands still behind the body does neither.
+the last pictures show it there nearly always. What stands still behind the body does neither. Beside a clamp, where
+markers stand still too, a dot that was not there at first is taken in where the body's rows go on.
 """
 
 from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 
-from tracking.affine import carry
+from tracking.candidate import Candidate
 from tracking.cut import doubted
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, find_spots, fit_dots, start_of
-from tracking.family import DIM, Family
+from tracking.family import DIM, IN_LINE, LINES, Family, lines_through
+from tracking.memory import Belief, Memory
 from tracking.shape import NEIGHBOURS, Pattern
 
 Array = NDArray[Any]
 
-EVERY, SOON = 12, 4  # frames from look to look; where the last one showed a dot that may be one
-LOOKS = 3  # one after the other that show a dot before it is believed
+EVERY, SOON = 12, 2  # frames from look to look; where the last one showed a dot that may be one
 KEPT, MOST_BYTES = 60, 2**28  # last pictures, in which a dot is followed back, and their size together
 FREE = 0.55  # spacings: how far on the body from known markers there may be another
-FAR = 1.8  # breadths: how far from them at most
+FAR = 2.4  # breadths: how far from them at most
 BESIDE = 0.5  # sine of the angle from the line to its nearest neighbour, from which on one stands beside a marker
-SAME = 0.3  # spacings: how far on the body a dot may seem to move from look to look
-MOVING = 0.5  # px: root mean square way through the picture that shows that something moves
-CARRIED = 0.5  # of that way: how far it may move on the body the while
-FOUND = 0.8  # of the pictures since it was first seen
+NEAR = 0.45  # spacings: how far from a candidate the same dot may seem to be at the next look
+SAME = 0.3  # spacings: how far from where it is expected a dot that is followed back may be
+FARTHER, BLUR = 2.0, 0.5  # times as far as between its looks, and px: likewise before its first look
+LOST = 2  # pictures before its first look without it, one after the other: there it was not in sight yet
+FOUND, LEAST_SEEN = 0.8, 3  # of the pictures since its first look, and how many at least: those that must show it
+PINNED = 0.15  # spacings: how far a dot that keeps its place in the picture may seem to move on the body
+NEXT = 1.3  # breadths: how far such a dot may be from known markers
+HOPPING, RESTING = 0.02, 0.1  # of how far a dot goes in all, and of the body's steps: its steps if it only hops
 ALIKE = 1.2  # ratio of radii within a family
-
-
-@dataclass(eq=False)
-class _Candidate:
-    """A dot not known yet: its places on the body at rest and in the picture [px], look by look."""
-
-    rest: list[Array]
-    place: list[Array]
-    since: int  # frame of the first look
-
-    def carried(self) -> bool:
-        """Whether the looks show that the body carries it."""
-        way, stray = (np.linalg.norm(np.std(places, axis=0)) for places in (self.place, self.rest))
-        return len(self.place) >= LOOKS and bool(way > MOVING and stray < CARRIED * way)
 
 
 @dataclass(frozen=True)
@@ -53,23 +45,41 @@ class Newcomer:
 
     Attributes:
         rest: where it belongs in the pattern [px], (2).
+        sigma: standard deviation of that along x and along y [px].
         parameters: of its disc, (12).
         seen: its place and sigma [px] by frame, up to the present one.
     """
 
     rest: Array
+    sigma: float
     parameters: Array
     seen: dict[int, tuple[Array, Array]]
 
 
+class _Earlier(NamedTuple):
+    """A picture, the known markers' places there [px], (M, 2), and which of these tell of the body, (M)."""
+
+    number: int
+    image: NDArray
+    place: Array
+    body: NDArray[np.bool_]
+
+
 @dataclass
 class Newcomers:
-    """Looks out for markers that are not known yet."""
+    """Looks out for markers that are not known yet.
+
+    Attributes:
+        family: what they look like.
+        unsure: standard deviation of where in the pattern each known marker belongs [px], (M).
+    """
 
     family: Family
-    candidates: list[_Candidate] = field(default_factory=list)
-    due: int = 0  # frame of the next look
-    recent: deque[tuple[int, NDArray, Array]] = field(default_factory=deque)
+    unsure: Array
+    _candidates: list[Candidate] = field(default_factory=list)
+    _due: int = 0  # frame of the next look
+    _recent: deque[_Earlier] = field(default_factory=deque)
+    _first: NDArray | None = None  # picture
 
     def look(
         self, number: int, image: NDArray, place: Array, seen: NDArray[np.bool_], marks: NDArray[np.bool_],
@@ -86,24 +96,32 @@ class Newcomers:
             pattern: of the known markers.
             parameters: of their discs, (M, 12).
         """
-        self.recent.append((number, image, place))
-        most = KEPT if self.candidates else EVERY  # fresh memory is slow
-        while len(self.recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
-            self.recent.popleft()
-        if number < self.due or 2 * (seen & ~marks).sum() < (~marks).sum():
+        now = _Earlier(number, image, place, seen & ~marks)
+        self._recent.append(now)
+        self._first = image if self._first is None else self._first
+        waiting = not all(item.settled() for item in self._candidates)
+        most = KEPT if waiting else EVERY  # fresh memory is slow
+        while len(self._recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
+            self._recent.popleft()
+        if number < self._due or 2 * now.body.sum() < (~marks).sum():
             return []
-        body, spacing = seen & ~marks, float(np.median(pattern.spacing))
-        breadth = _breadth(pattern.rest[body])
+        spacing, breadth = float(np.median(pattern.spacing)), _breadth(pattern.rest[now.body])
         found = self._strangers(image, place, FAR * breadth, pattern, parameters)
-        rest = carry(place[body], pattern.rest[body], found)
-        away = np.linalg.norm(rest[:, None] - pattern.rest[None], axis=2)
-        fit = (away.min(axis=1) > FREE * spacing) & (away[:, body].min(axis=1) < FAR * breadth)
-        self._count(found[fit], rest[fit], number, SAME * spacing)
-        self.due = number + (SOON if self.candidates else EVERY)
-        ready = [item for item in self.candidates if item.carried()]
-        self.candidates = [item for item in self.candidates if item not in ready]
-        followed = [self._followed_back(item, ~marks, pattern, parameters, SAME * spacing) for item in ready]
-        return [newcomer for newcomer in followed if newcomer is not None]
+        rest = self._at_rest(pattern, now, found).place
+        near = np.linalg.norm(rest[:, None] - pattern.rest[now.body], axis=2).min(axis=1) < FAR * breadth
+        self._count(now, rest[near], found[near], NEAR * spacing)
+        self._due = number + (EVERY if all(item.settled() for item in self._candidates) else SOON)
+        rest = pattern.rest[~marks]
+        ready = [item for item in self._candidates if item.carried() or self._stands(item, rest, parameters, spacing)]
+        self._candidates = [item for item in self._candidates if item not in ready]
+        newcomers: list[Newcomer] = []
+        for item in ready:
+            newcomer = self._followed_back(item, pattern, parameters, SAME * spacing)
+            others = np.concatenate([pattern.rest, *(other.rest[None] for other in newcomers)])
+            if newcomer is not None and np.linalg.norm(others - newcomer.rest, axis=1).min() > FREE * spacing:
+                newcomers.append(newcomer)
+        self.unsure = np.append(self.unsure, [newcomer.sigma for newcomer in newcomers])
+        return newcomers
 
     def _strangers(self, image: NDArray, place: Array, reach: float, pattern: Pattern, parameters: Array) -> Array:
         """Dots of the family within reach [px] of the body that are no known marker's [px], (D, 2)."""
@@ -123,37 +141,116 @@ class Newcomers:
         good = self.family.admits(dots) & (dots.contrast / self.family.contrast > DIM)
         return good & (np.abs(np.log(dots.radius / self.family.radius)) < np.log(ALIKE))
 
-    def _count(self, found: Array, rest: Array, number: int, same: float) -> None:
-        """Candidates that this look does not show are given up; what it shows for the first time becomes one."""
-        earlier, self.candidates = self.candidates, []
-        for place, own in zip(found, rest, strict=True):
-            gaps = [float(np.linalg.norm(item.rest[-1] - own)) for item in earlier]
-            near = bool(gaps) and min(gaps) < same
-            item = earlier.pop(int(np.argmin(gaps))) if near else _Candidate([], [], number)
-            item.rest.append(own)
-            item.place.append(place)
-            self.candidates.append(item)
+    def _at_rest(self, pattern: Pattern, then: _Earlier, points: Array) -> Belief:
+        """Where points (P, 2) of a picture [px] would be in the pattern."""
+        if not len(points):
+            return Belief(points, np.empty(0))
+        body, count = np.flatnonzero(then.body), len(points)
+        rest = np.concatenate([pattern.rest[body], points])
+        unsure = np.append(self.unsure[body], np.full(count, np.inf))
+        memory = Memory(np.concatenate([then.place[body], points]))
+        believed = memory.carried(rest, unsure == 0.0, Belief(rest, unsure))
+        return Belief(believed.place[-count:], believed.sigma[-count:])
 
-    def _followed_back(
-        self, candidate: _Candidate, body: NDArray[np.bool_], pattern: Pattern, parameters: Array, same: float
-    ) -> Newcomer | None:
+    def _count(self, now: _Earlier, rest: Array, found: Array, most: float) -> None:
+        """Candidates that this look does not show are given up; what it shows for the first time becomes one.
+
+        Args:
+            now: the picture.
+            rest: where the dots would be in the pattern [px], (D, 2).
+            found: the dots [px], (D, 2).
+            most: how far one may seem to be from where it was before [px].
+        """
+        before = self._candidates
+        gaps = np.array([[item.gap(*dot) for item in before] for dot in zip(rest, found, strict=True)])
+        gaps = gaps.reshape(len(found), len(before))
+        pairs = zip(*linear_sum_assignment(np.minimum(gaps, most)), strict=True)
+        known = {row: before[column] for row, column in pairs if gaps[row, column] < most}
+        self._candidates = [known.get(row, Candidate()) for row in range(len(found))]
+        for item, own, place in zip(self._candidates, rest, found, strict=True):
+            item.add(now.number, own, place, now.place)
+
+    def _stands(self, candidate: Candidate, rest: Array, parameters: Array, spacing: float) -> bool:
+        """Whether it stands still where the rows of the body at rest (M, 2) go on, and did not at first."""
+        if not candidate.still(PINNED * spacing) or candidate.settled() or self._first is None:
+            return False
+        own, beside = np.median(candidate.rest, axis=0), IN_LINE * spacing
+        if np.linalg.norm(rest - own, axis=1).min() > NEXT * _breadth(rest):
+            return False
+        least = min(lines_through(place, np.delete(rest, k, axis=0), beside) for k, place in enumerate(rest))
+        if lines_through(own, rest, beside) < np.clip(least, 1, LINES):
+            return False
+        return not self._admitted(fit_dots(self._first, _starts(candidate.place[-1][None], parameters)))[0]
+
+    def _followed_back(self, candidate: Candidate, pattern: Pattern, parameters: Array, same: float) -> Newcomer | None:
         """The candidate in the last pictures; None where too few of those since its first look show it."""
-        rest = np.median(candidate.rest, axis=0)
+        always = len(self._recent[0].place)  # those known in all of the pictures: more of them put it elsewhere
+        memory = Memory(np.concatenate([pattern.rest[:always], np.median(candidate.rest, axis=0)[None]]))
+        carried = {then.number: _carried(memory, then) for then in self._recent}
+        looks = [look for look in zip(candidate.frame, candidate.place, strict=True) if look[0] in carried]
+        frames, stray = [frame for frame, _ in looks], np.array([place - carried[frame] for frame, place in looks])
         seen: dict[int, tuple[Array, Array]] = {}
         shown = np.full(PARAMETERS, np.nan)
-        since = 0
-        for number, image, place in self.recent:
-            riding = body[: len(place)]
-            expected = carry(pattern.rest[: len(place)][riding], place[riding], rest[None])
-            near = np.argsort(np.linalg.norm(place - expected, axis=1))[:NEIGHBOURS]
-            starts = np.concatenate([_starts(expected, parameters), _moved(parameters[near], place[near])])
-            dots = doubted(image, fit_dots(image, starts, 1))
-            since += number >= candidate.since
-            if self._admitted(dots)[0] and np.linalg.norm(dots.centre[0] - expected[0]) < same:
-                seen[number] = dots.centre[0], dots.sigma[0]
-                shown = dots.parameters[0]
-        enough = sum(number >= candidate.since for number in seen) >= FOUND * since
-        return Newcomer(rest, shown, seen) if enough and seen else None
+        since = lost = 0
+        off, farthest = stray[-1], 0.0
+        for then in reversed(self._recent):
+            between = then.number >= candidate.frame[0]
+            if between:
+                since += 1
+                off = np.array([np.interp(then.number, frames, along) for along in stray.T])
+            expected = carried[then.number] + off
+            near = np.argsort(np.linalg.norm(then.place - expected, axis=1))[:NEIGHBOURS]
+            starts = np.concatenate([_starts(expected[None], parameters), _moved(parameters[near], then.place[near])])
+            dots = doubted(then.image, fit_dots(then.image, starts, 1))
+            miss = float(np.linalg.norm(dots.centre[0] - expected))
+            if self._admitted(dots)[0] and miss < (same if between else min(same, FARTHER * farthest + BLUR)):
+                farthest, lost, off = max(farthest, miss), 0, off + dots.centre[0] - expected
+                shown = shown if seen else dots.parameters[0]
+                seen[then.number] = dots.centre[0], dots.sigma[0]
+            elif not between:
+                lost += 1
+                if lost == LOST:
+                    break
+        path = [(seen[number][0], carried[number]) for number in seen if number >= candidate.frame[0]]
+        if len(path) < max(FOUND * since, LEAST_SEEN) or _hops(*np.array(path).swapaxes(0, 1)):
+            return None
+        return Newcomer(*self._home(pattern, seen), shown, seen)
+
+    def _home(self, pattern: Pattern, seen: dict[int, tuple[Array, Array]]) -> tuple[Array, float]:
+        """Where in the pattern a dot belongs, and how well that is known [px], by its places and sigma by frame.
+
+        Best where the body was bent as it is in the pattern.
+        """
+        beliefs = []
+        for then in self._recent:
+            body = np.flatnonzero(then.body)
+            if then.number in seen and 2 * len(body) > len(then.body):
+                place, sigma = self._at_rest(pattern, then, seen[then.number][0][None])
+                unlike = np.hypot(_bent(pattern.rest[body], then.place[body]), sigma[0])
+                beliefs.append((float(unlike), then.number, place[0], float(sigma[0])))
+        return min(beliefs)[2:]
+
+
+def _carried(memory: Memory, then: _Earlier) -> Array:
+    """Where the markers of a picture put the last of the memory's, which was not known then [px], (2)."""
+    place = then.place[: len(memory.rest) - 1], then.body[: len(memory.rest) - 1]
+    return memory.carried(np.append(place[0], [[0.0, 0.0]], axis=0), np.append(place[1], False)).place[-1]
+
+
+def _hops(found: Array, carried: Array) -> bool:
+    """Whether what was followed [px], (T, 2), is one still dot after the other.
+
+    Then it mostly keeps its place, where the body would have carried it on, (T, 2).
+    """
+    steps, body = (np.median(np.linalg.norm(np.diff(way, axis=0), axis=1)) for way in (found, carried))
+    return bool(steps < HOPPING * np.linalg.norm(np.std(found, axis=0)) and steps < RESTING * body)
+
+
+def _bent(rest: Array, place: Array) -> float:
+    """How far places (M, 2) are from those at rest moved, turned and scaled to fit them: root mean square [px]."""
+    before, after = ((item - item.mean(axis=0)) @ [1.0, 1j] for item in (rest, place))
+    left = after - before * np.vdot(before, after) / np.vdot(before, before)
+    return float(np.sqrt((np.abs(left) ** 2).mean()))
 
 
 def _breadth(rest: Array) -> float:

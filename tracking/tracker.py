@@ -12,7 +12,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tracking.affine import carry
 from tracking.cut import WholeLooks
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, SHADES, Dots, apart, find_spots, fit_dots, shade_of, start_of
@@ -52,7 +51,7 @@ class Tracker:
         self.missing = np.zeros(len(first), dtype=np.int64)  # frames since each was seen
         self.doubt = np.zeros(len(first))  # standard deviation of where each is believed [px]
         self.searched = 0  # frames since the last search
-        self.newcomers = Newcomers(family)
+        self.newcomers = Newcomers(family, np.zeros(len(first)))
         self.looks = WholeLooks.none(len(first))
         self.outlines = Outlines(first)
 
@@ -94,24 +93,26 @@ class Tracker:
             number, image, self.motion.last, self.missing == 0, self.marks.known, self.pattern, self.parameters
         )
         for newcomer in found:
-            rest, body = self.pattern.rest, ~self.marks.known
-            places = np.concatenate(
-                [carry(rest[body], place[body], newcomer.rest[None]) for place in self.motion.places]
-            )
-            if number in newcomer.seen:
-                places[-1] = newcomer.seen[number][0]
-            self.motion.join(places)
             self.memory = self.memory.join(newcomer.rest)
+            self.motion.join(self._lately(newcomer, number))
             self.marks.join()
             self.looks.join()
             self.outlines.join()
-            self.pattern = Pattern.of(np.concatenate([rest, newcomer.rest[None]]))
+            self.pattern = Pattern.of(np.concatenate([self.pattern.rest, newcomer.rest[None]]))
             self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
             self.missing = np.append(self.missing, 0 if number in newcomer.seen else 1)
             self.doubt = np.append(
                 self.doubt, 0.0 if number in newcomer.seen else float(np.median(self.pattern.spacing))
             )
         return found
+
+    def _lately(self, newcomer: Newcomer, number: int) -> Array:
+        """Its places in the last pictures [px], (4, 2), where it was not seen as the others put it."""
+        known, last = np.append(~self.marks.known, False), []
+        for frame, place in enumerate(self.motion.places, start=number + 1 - len(self.motion.places)):
+            carried = self.memory.carried(np.append(place, newcomer.rest[None], axis=0), known).place[-1]
+            last.append(newcomer.seen[frame][0] if frame in newcomer.seen else carried)
+        return np.array(last)
 
     def _holds(self, dots: Dots) -> bool:
         """Whether all markers that were in sight are among the dots, and some were."""

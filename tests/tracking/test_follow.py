@@ -202,6 +202,37 @@ def test_hidden_columns_far_apart_are_taken_in() -> None:
     assert np.isfinite(tracks.pixel[60:]).all()
 
 
+@pytest.mark.parametrize("tip", [25.0, 45.0])
+def test_dots_hidden_at_first_beside_the_clamp_are_taken_in(tip: float) -> None:
+    """They move by 0.2 to 10 px, and the body begins bent: from what swings nobody could tell where they belong."""
+    truth = bent(grid(), tip * np.cos(0.4 * np.arange(90)))
+    places = truth.copy()
+    places[:20, truth[0, :, 0] < 130.0] = np.nan
+    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 9
+    match = order(tracks.start, truth[0])
+    assert sorted(match) == list(range(24))
+    assert np.linalg.norm(tracks.start[match] - truth[0], axis=1).max() < 5.0
+    assert np.nanmax(np.linalg.norm(tracks.pixel[:, match] - truth, axis=2)) < 0.3
+    assert np.isfinite(tracks.pixel[-1]).all()
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_swarm_of_dots_that_stand_still_is_not_taken_in(seed: int) -> None:
+    """So many that, where the body swings, there is always one that it could have carried there."""
+    truth = bent(grid(), 30.0 * np.sin(2 * np.pi * np.arange(80) / 23))
+    random, blots = np.random.default_rng(seed), np.empty((0, 2))
+    while len(blots) < 24:
+        blot = random.uniform([8.0, 8.0], [350.0, 230.0])
+        others = np.concatenate([truth.reshape(-1, 2), blots])
+        if np.linalg.norm(others - blot, axis=1).min() > 16.0:
+            blots = np.concatenate([blots, blot[None]])
+    tracks = follow(Drawn(truth, blots=tuple(map(tuple, blots))), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 0
+    assert np.isfinite(tracks.pixel).mean() > 0.99
+    assert np.nanmax(np.linalg.norm(tracks.pixel[:, order(tracks.start, truth[0])] - truth, axis=2)) < 0.3
+
+
 @pytest.mark.parametrize("period", [10, 35, 160])
 def test_what_stands_still_behind_the_body_is_not_taken_in(period: int) -> None:
     """Nor where the swinging body comes back to it again and again, or leaves it slowly."""

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from tracking.affine import carry
 from tracking.shape import Pattern, recognise
 
 
@@ -70,14 +69,3 @@ def test_who_is_in_sight_keeps_its_place_when_others_come_back() -> None:
         Pattern.of(curled(0.0)), believed, believed, np.where(seen, 0.0, -5.0), dots, 2.2, 1.0, np.where(seen, 1.0, 0.0)
     )
     np.testing.assert_array_equal(match[:6], np.arange(6))
-
-
-def test_markers_out_of_sight_ride_along() -> None:
-    """On an affinely moved body their places are exact but for the pull towards the whole body's map."""
-    rest = grid()
-    matrix = np.array([[0.9, -0.4], [0.35, 1.05]])
-    moved = rest @ matrix.T + [10.0, -5.0]
-    known = np.ones(27, bool)
-    known[[0, 8, 14]] = False
-    carried = carry(rest[known], moved[known], rest[~known])
-    np.testing.assert_allclose(carried, moved[~known], atol=0.6)
