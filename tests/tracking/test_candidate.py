@@ -1,0 +1,56 @@
+import numpy as np
+import pytest
+
+from tracking.candidate import Candidate
+
+
+def swing(looks: int) -> np.ndarray:
+    """Six markers' places, look by look, of a body that swings by 20 px at its end, (looks, 6, 2)."""
+    way = 20.0 * np.sin(1.1 * np.arange(looks))[:, None] * np.linspace(0.1, 1.0, 6) ** 2
+    return np.stack([np.tile(30.0 * np.arange(6), (looks, 1)), way], axis=-1)
+
+
+def candidate(place: np.ndarray, rest: np.ndarray) -> Candidate:
+    """What such looks come to: places in the picture and on the body, (looks, 2) each."""
+    item = Candidate()
+    for frame, body in enumerate(swing(len(place))):
+        item.add(2 * frame, rest[frame], place[frame], body)
+    return item
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_hardly_moves_is_carried_if_it_moves_with_the_body(seed: int) -> None:
+    """By 0.5 px, where the others put it to within 4 px only."""
+    random = np.random.default_rng(seed)
+    way = 0.5 * np.sin(1.1 * np.arange(20))[:, None] * [0.3, 1.0]
+    rest = random.normal(0.0, 2.0, (20, 2))
+    with_it = candidate(way + random.normal(0.0, 0.03, way.shape), rest)
+    alone = candidate(random.normal(0.0, 0.35, way.shape), rest)
+    assert with_it.carried()
+    assert not alone.carried()
+
+
+def test_what_is_carried_far_is_known_after_a_few_looks() -> None:
+    random = np.random.default_rng(1)
+    place = swing(6)[:, 5] + [30.0, 0.0]
+    rest = random.normal(0.0, 1.0, place.shape)
+    assert candidate(place, rest).carried()
+    assert not candidate(place[:3], rest[:3]).carried()
+    assert not candidate(np.zeros((6, 2)), rest - swing(6)[:, 5]).carried()
+
+
+def test_what_shakes_with_the_camera_stands_still() -> None:
+    random = np.random.default_rng(2)
+    still = candidate(random.normal(0.0, 0.3, (40, 2)), random.normal(0.0, 0.5, (40, 2)))
+    assert still.still()
+    assert still.still(most=3.0)
+    assert not still.still(most=0.1)
+    assert still.settled()
+    assert not candidate(np.zeros((5, 2)), np.zeros((5, 2))).still()
+
+
+def test_a_dot_is_known_again_by_its_place_on_the_body_or_in_the_picture() -> None:
+    item = candidate(np.tile([50.0, 80.0], (4, 1)), np.array([[48.0, 70.0], [52.0, 90.0], [48.0, 70.0], [52.0, 90.0]]))
+    assert item.gap(np.array([48.0, 71.0]), np.array([70.0, 80.0])) == pytest.approx(1.0)
+    assert item.gap(np.array([48.0, 60.0]), np.array([50.0, 80.0])) == pytest.approx(3.0)
+    assert item.gap(np.array([48.0, 40.0]), np.array([50.0, 40.0])) == pytest.approx(30.0)
