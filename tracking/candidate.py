@@ -1,7 +1,8 @@
 """A dot that may be a marker that is not known yet, look by look, and whether the body carries it."""
 
+from collections import deque
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,64 +15,75 @@ LONG, LEAST = 15, 0.15  # looks and px: likewise, of a dot that hardly moves
 MODES, ALONE = 2, 0.1  # ways of the body to move, and of the variance of such a dot's way: what these may not explain
 ASTRAY = 0.4  # of the way of the marker that moves most: how far it may seem to move on the body
 STEADY = 1.0  # px: root mean square way of what stands still, though the camera may not
+KEPT = 40  # looks
 SEEMING = 0.3  # of how far it seems to move on the body: so much farther is a dot that keeps its place in the picture
+
+
+class Look(NamedTuple):
+    """What one look shows of a dot.
+
+    Attributes:
+        frame: its number.
+        rest: the dot's place on the body at rest, as the known markers put it [px], (2).
+        place: in the picture [px], (2).
+        body: the known markers' places in the picture [px], (M, 2).
+    """
+
+    frame: int
+    rest: Array
+    place: Array
+    body: Array
 
 
 @dataclass(eq=False)
 class Candidate:
-    """A dot's places, look by look.
+    """A dot's last looks, one after the other."""
 
-    Attributes:
-        frame: of each look.
-        rest: on the body at rest, as the known markers there put it [px], (2) each.
-        place: in the picture [px], (2) each.
-        body: the known markers' places in the picture then [px], (M, 2) each.
-    """
+    looks: deque[Look] = field(default_factory=lambda: deque(maxlen=KEPT))
 
-    frame: list[int] = field(default_factory=list)
-    rest: list[Array] = field(default_factory=list)
-    place: list[Array] = field(default_factory=list)
-    body: list[Array] = field(default_factory=list)
+    @property
+    def rest(self) -> Array:
+        """Its places on the body at rest [px], (L, 2)."""
+        return np.array([look.rest for look in self.looks])
 
-    def add(self, frame: int, rest: Array, place: Array, body: Array) -> None:
-        """One more look."""
-        self.frame.append(frame)
-        self.rest.append(rest)
-        self.place.append(place)
-        self.body.append(body)
+    @property
+    def place(self) -> Array:
+        """Its places in the picture [px], (L, 2)."""
+        return np.array([look.place for look in self.looks])
 
     def gap(self, rest: Array, place: Array) -> float:
         """How far from it a dot is that stands there on the body and in the picture [px]."""
         seeming = float(np.linalg.norm(self.rest - rest, axis=1).min())
-        return min(seeming, float(np.linalg.norm(self.place[-1] - place)) + SEEMING * seeming)
+        return min(seeming, float(np.linalg.norm(self.looks[-1].place - place)) + SEEMING * seeming)
 
     def carried(self) -> bool:
         """Whether the looks show that the body carries it."""
-        looks, way, stray = len(self.place), _spread(self.place), _spread(self.rest)
-        if looks >= LOOKS and way > MOVING and stray < CARRIED * way:
+        way, stray = _spread(self.place), _spread(self.rest)
+        if len(self.looks) >= LOOKS and way > MOVING and stray < CARRIED * way:
             return True
-        return looks >= LONG and way > LEAST and self._sways()
+        return len(self.looks) >= LONG and way > LEAST and self._sways()
 
     def still(self, most: float = np.inf) -> bool:
         """Whether it keeps its place in the picture; and on the body, to at most so many [px]."""
-        return len(self.place) >= LONG and _spread(self.place) < STEADY and _spread(self.rest) < most
+        return len(self.looks) >= LONG and _spread(self.place) < STEADY and _spread(self.rest) < most
 
     def settled(self) -> bool:
         """Whether nothing new is to be expected of it."""
-        return len(self.place) > 2 * LONG and self.still()
+        return len(self.looks) > 2 * LONG and self.still()
 
     def _sways(self) -> bool:
         """Whether it moves when the body moves: beside a clamp, where it moves less than the others can tell."""
-        looks, common = len(self.place), min(len(places) for places in self.body)
-        body = np.stack([places[:common].ravel() for places in self.body])
+        common = min(len(look.body) for look in self.looks)
+        body = np.stack([look.body[:common].ravel() for look in self.looks])
         if _spread(self.rest) > ASTRAY * np.linalg.norm(body.std(axis=0).reshape(-1, 2), axis=1).max():
             return False
         modes = np.linalg.svd(body - body.mean(axis=0), full_matrices=False)[0][:, :MODES]
-        own = np.stack(self.place) - np.mean(self.place, axis=0)
+        own = self.place - self.place.mean(axis=0)
         left = own - modes @ (modes.T @ own)
-        return bool((left**2).sum() / (looks - 1 - MODES) < ALONE * (own**2).sum() / (looks - 1))
+        free = len(self.looks) - 1
+        return bool((left**2).sum() / (free - MODES) < ALONE * (own**2).sum() / free)
 
 
-def _spread(places: list[Array]) -> float:
-    """Root mean square distance from their mean."""
+def _spread(places: Array) -> float:
+    """Root mean square distance of places (L, 2) from their mean."""
     return float(np.linalg.norm(np.std(places, axis=0)))

@@ -50,7 +50,7 @@ class Marks:
             self.known |= still & (left > LEFT_BEHIND * pattern.spacing) & (left > BEYOND_DOUBT * belief.sigma)
 
     def join(self) -> None:
-        """One more marker, which moves."""
+        """One more marker, which is none."""
         self.known, self._way = np.append(self.known, False), np.append(self._way, 1.0)
 
 

@@ -46,7 +46,7 @@ class Memory:
 
     def __init__(self, rest: Array) -> None:
         """Of markers at rest at these places [px], (M, 2)."""
-        self.rest = rest
+        self._rest = rest
         distance = cKDTree(rest).query(rest, min(AROUND + 1, len(rest)))[0]
         self._unit = float(np.median(distance[:, -1]))
         self._error = EXACT * self._unit
@@ -67,7 +67,7 @@ class Memory:
         Complex Chebyshev polynomials along the body's length: the real part of their values is the way along it, the
         imaginary part that across it.
         """
-        arm = self.rest - self.rest.mean(axis=0)
+        arm = self._rest - self._rest.mean(axis=0)
         axis = complex(*np.linalg.eigh(arm.T @ arm)[1][:, -1])
         place = (arm[:, 0] + 1j * arm[:, 1]) * np.conj(axis)
         half = max(float(np.abs(place.real).max()), self._unit)
@@ -80,7 +80,7 @@ class Memory:
 
     def _stretching(self) -> Array:
         """Ways to stretch and shear smoothly, as likely as they are [px], (2 M, K)."""
-        square = ((self.rest[:, None] - self.rest[None]) ** 2).sum(axis=2)
+        square = ((self._rest[:, None] - self._rest[None]) ** 2).sum(axis=2)
         variance, ways = np.linalg.eigh(np.exp(-0.5 * square / (LENGTH * self._unit) ** 2))
         variance, ways = variance[-SMOOTH:], ways[:, -SMOOTH:]
         large = variance > SMOOTHEST * variance[-1]
@@ -88,7 +88,7 @@ class Memory:
 
     def add(self, place: Array, seen: NDArray[np.bool_]) -> None:
         """The markers' places [px], (M, 2), in the next frame, seen (M) or believed."""
-        away = place - self.rest
+        away = place - self._rest
         if len(self._shapes) and np.abs(away.ravel() - self._shapes[-1]).max() < NEW * self._unit:
             return
         self._added += 1
@@ -102,12 +102,12 @@ class Memory:
 
     def join(self, rest: Array) -> "Memory":
         """The same with one more marker, by its place at rest [px], (2)."""
-        joined = Memory(np.concatenate([self.rest, rest[None]]))
-        known = np.arange(len(joined.rest)) < len(self.rest)
+        joined = Memory(np.concatenate([self._rest, rest[None]]))
+        known = np.arange(len(joined._rest)) < len(self._rest)
         for shape in self._shapes:
-            place = joined.rest.copy()
+            place = joined._rest.copy()
             place[:-1] += shape.reshape(-1, 2)
-            away = joined.carried(place, known).place - joined.rest
+            away = joined.carried(place, known).place - joined._rest
             joined._shapes = np.concatenate([joined._shapes, away.reshape(1, -1)])
         joined._every, joined._added, joined._known = self._every, self._added, np.append(self._known, 0.0)
         return joined
@@ -125,7 +125,7 @@ class Memory:
         """
         if known.all():
             return Belief(position.copy(), np.zeros(len(known)))
-        place, weight = np.where(known[:, None], position, self.rest), known.astype(float)
+        place, weight = np.where(known[:, None], position, self._rest), known.astype(float)
         if guess is not None:
             unsure = (~known).sum() * guess.sigma**2
             weight = np.where(known, 1.0, self._error**2 / (self._error**2 + unsure))  # as if of a known one's error
@@ -168,7 +168,7 @@ class Memory:
     def shapes(self, most: int) -> list[Array]:
         """Up to so many of the shapes, evenly spread: places [px], (M, 2)."""
         chosen = np.unique(np.linspace(0, len(self._shapes) - 1, min(most, len(self._shapes))).astype(int))
-        return [self.rest + self._shapes[k].reshape(-1, 2) for k in chosen]
+        return [self._rest + self._shapes[k].reshape(-1, 2) for k in chosen]
 
     def _about(self, place: Array, told: Array, asked: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Where the body may be, (2 M), and its ways from there, as long as they are likely, (2 M, K) [px].
@@ -181,12 +181,12 @@ class Memory:
         known = self._known[asked].min(initial=self._added)
         any_ways = self._any * (self._fading / (self._fading + known))
         if not len(self._shapes):
-            return self.rest.ravel(), any_ways
-        away = (self._shapes - (place - self.rest).ravel()) ** 2 @ told
+            return self._rest.ravel(), any_ways
+        away = (self._shapes - (place - self._rest).ravel()) ** 2 @ told
         near = self._shapes[np.argsort(away)[:NEAREST]]
         middle = near.mean(axis=0)
         seen_ways = WIDER / np.sqrt(len(near)) * (near - middle).T
-        return self.rest.ravel() + middle, np.concatenate([any_ways, seen_ways], axis=1)
+        return self._rest.ravel() + middle, np.concatenate([any_ways, seen_ways], axis=1)
 
     def _fitted(self, own: Array, told: Array, ways: Array) -> tuple[Array, Array]:
         """The Cholesky factor of the normal equations, (K, K), and the amounts of the ways that give the own, (K)."""

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from tracking.candidate import Candidate
+from tracking.candidate import Candidate, Look
 from tracking.cut import doubted
 from tracking.disc import PARAMETERS
 from tracking.dots import SAME_PLACE, Dots, apart, find_spots, fit_dots, start_of
@@ -33,6 +33,7 @@ SAME = 0.3  # spacings: how far from where it is expected a dot that is followed
 FARTHER, BLUR = 2.0, 0.5  # times as far as between its looks, and px: likewise before its first look
 LOST = 2  # pictures before its first look without it, one after the other: there it was not in sight yet
 FOUND, LEAST_SEEN = 0.8, 3  # of the pictures since its first look, and how many at least: those that must show it
+FEWEST = 3  # markers of the body that tell where on it a dot belongs
 PINNED = 0.15  # spacings: how far a dot that keeps its place in the picture may seem to move on the body
 NEXT = 1.3  # breadths: how far such a dot may be from known markers
 HOPPING, RESTING = 0.02, 0.1  # of how far a dot goes in all, and of the body's steps: its steps if it only hops
@@ -99,17 +100,16 @@ class Newcomers:
         now = _Earlier(number, image, place, seen & ~marks)
         self._recent.append(now)
         self._first = image if self._first is None else self._first
-        waiting = not all(item.settled() for item in self._candidates)
-        most = KEPT if waiting else EVERY  # fresh memory is slow
+        most = KEPT if self._candidates else EVERY  # fresh memory is slow
         while len(self._recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
             self._recent.popleft()
         if number < self._due or 2 * now.body.sum() < (~marks).sum():
             return []
         spacing, breadth = float(np.median(pattern.spacing)), _breadth(pattern.rest[now.body])
         found = self._strangers(image, place, FAR * breadth, pattern, parameters)
-        rest = self._at_rest(pattern, now, found).place
-        near = np.linalg.norm(rest[:, None] - pattern.rest[now.body], axis=2).min(axis=1) < FAR * breadth
-        self._count(now, rest[near], found[near], NEAR * spacing)
+        own = self._at_rest(pattern, now, found).place
+        near = np.linalg.norm(own[:, None] - pattern.rest[now.body], axis=2).min(axis=1) < FAR * breadth
+        self._count(now, own[near], found[near], NEAR * spacing)
         self._due = number + (EVERY if all(item.settled() for item in self._candidates) else SOON)
         rest = pattern.rest[~marks]
         ready = [item for item in self._candidates if item.carried() or self._stands(item, rest, parameters, spacing)]
@@ -168,7 +168,7 @@ class Newcomers:
         known = {row: before[column] for row, column in pairs if gaps[row, column] < most}
         self._candidates = [known.get(row, Candidate()) for row in range(len(found))]
         for item, own, place in zip(self._candidates, rest, found, strict=True):
-            item.add(now.number, own, place, now.place)
+            item.looks.append(Look(now.number, own, place, now.place))
 
     def _stands(self, candidate: Candidate, rest: Array, parameters: Array, spacing: float) -> bool:
         """Whether it stands still where the rows of the body at rest (M, 2) go on, and did not at first."""
@@ -180,21 +180,22 @@ class Newcomers:
         least = min(lines_through(place, np.delete(rest, k, axis=0), beside) for k, place in enumerate(rest))
         if lines_through(own, rest, beside) < np.clip(least, 1, LINES):
             return False
-        return not self._admitted(fit_dots(self._first, _starts(candidate.place[-1][None], parameters)))[0]
+        return not self._admitted(fit_dots(self._first, _starts(candidate.place[-1:], parameters)))[0]
 
     def _followed_back(self, candidate: Candidate, pattern: Pattern, parameters: Array, same: float) -> Newcomer | None:
         """The candidate in the last pictures; None where too few of those since its first look show it."""
         always = len(self._recent[0].place)  # those known in all of the pictures: more of them put it elsewhere
         memory = Memory(np.concatenate([pattern.rest[:always], np.median(candidate.rest, axis=0)[None]]))
-        carried = {then.number: _carried(memory, then) for then in self._recent}
-        looks = [look for look in zip(candidate.frame, candidate.place, strict=True) if look[0] in carried]
-        frames, stray = [frame for frame, _ in looks], np.array([place - carried[frame] for frame, place in looks])
+        carried = {then.number: _carried(memory, then, always) for then in self._recent}
+        looks = [look for look in candidate.looks if look.frame in carried]
+        frames, stray = [look.frame for look in looks], np.array([look.place - carried[look.frame] for look in looks])
+        first = candidate.looks[0].frame
         seen: dict[int, tuple[Array, Array]] = {}
         shown = np.full(PARAMETERS, np.nan)
         since = lost = 0
         off, farthest = stray[-1], 0.0
         for then in reversed(self._recent):
-            between = then.number >= candidate.frame[0]
+            between = then.number >= first
             if between:
                 since += 1
                 off = np.array([np.interp(then.number, frames, along) for along in stray.T])
@@ -211,30 +212,31 @@ class Newcomers:
                 lost += 1
                 if lost == LOST:
                     break
-        path = [(seen[number][0], carried[number]) for number in seen if number >= candidate.frame[0]]
+        path = [(seen[number][0], carried[number]) for number in seen if number >= first]
         if len(path) < max(FOUND * since, LEAST_SEEN) or _hops(*np.array(path).swapaxes(0, 1)):
             return None
-        return Newcomer(*self._home(pattern, seen), shown, seen)
+        home = self._home(pattern, seen)
+        return None if home is None else Newcomer(*home, shown, seen)
 
-    def _home(self, pattern: Pattern, seen: dict[int, tuple[Array, Array]]) -> tuple[Array, float]:
+    def _home(self, pattern: Pattern, seen: dict[int, tuple[Array, Array]]) -> tuple[Array, float] | None:
         """Where in the pattern a dot belongs, and how well that is known [px], by its places and sigma by frame.
 
-        Best where the body was bent as it is in the pattern.
+        Best where the body was bent as it is in the pattern; None where no picture shows enough of that.
         """
         beliefs = []
         for then in self._recent:
             body = np.flatnonzero(then.body)
-            if then.number in seen and 2 * len(body) > len(then.body):
+            if then.number in seen and len(body) >= FEWEST:
                 place, sigma = self._at_rest(pattern, then, seen[then.number][0][None])
                 unlike = np.hypot(_bent(pattern.rest[body], then.place[body]), sigma[0])
                 beliefs.append((float(unlike), then.number, place[0], float(sigma[0])))
-        return min(beliefs)[2:]
+        return min(beliefs)[2:] if beliefs else None
 
 
-def _carried(memory: Memory, then: _Earlier) -> Array:
-    """Where the markers of a picture put the last of the memory's, which was not known then [px], (2)."""
-    place = then.place[: len(memory.rest) - 1], then.body[: len(memory.rest) - 1]
-    return memory.carried(np.append(place[0], [[0.0, 0.0]], axis=0), np.append(place[1], False)).place[-1]
+def _carried(memory: Memory, then: _Earlier, count: int) -> Array:
+    """Where the first so many markers of a picture put the one that comes after them in the memory [px], (2)."""
+    place, known = np.append(then.place[:count], [[0.0, 0.0]], axis=0), np.append(then.body[:count], False)
+    return memory.carried(place, known).place[-1]
 
 
 def _hops(found: Array, carried: Array) -> bool:

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from tracking.candidate import Candidate
+from tracking.candidate import Candidate, Look
 
 
 def swing(looks: int) -> np.ndarray:
@@ -14,7 +14,7 @@ def candidate(place: np.ndarray, rest: np.ndarray) -> Candidate:
     """What such looks come to: places in the picture and on the body, (looks, 2) each."""
     item = Candidate()
     for frame, body in enumerate(swing(len(place))):
-        item.add(2 * frame, rest[frame], place[frame], body)
+        item.looks.append(Look(2 * frame, rest[frame], place[frame], body))
     return item
 
 
@@ -54,3 +54,14 @@ def test_a_dot_is_known_again_by_its_place_on_the_body_or_in_the_picture() -> No
     assert item.gap(np.array([48.0, 71.0]), np.array([70.0, 80.0])) == pytest.approx(1.0)
     assert item.gap(np.array([48.0, 60.0]), np.array([50.0, 80.0])) == pytest.approx(3.0)
     assert item.gap(np.array([48.0, 40.0]), np.array([50.0, 40.0])) == pytest.approx(30.0)
+
+
+def test_what_rested_for_long_is_known_soon_after_it_moves() -> None:
+    random = np.random.default_rng(3)
+    rest = random.normal(0.0, 0.1, (506, 2))
+    place = np.concatenate([np.zeros((500, 2)), swing(6)[:, 5] - [150.0, 0.0]])
+    assert candidate(place[:500], rest[:500]).settled()
+    moved = candidate(place, rest)
+    assert moved.carried()
+    assert not moved.settled()
+    assert len(moved.looks) < 50
