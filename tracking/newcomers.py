@@ -36,6 +36,7 @@ FOUND, LEAST_SEEN = 0.8, 3  # of the pictures since its first look, and how many
 FEWEST = 3  # markers of the body that tell where on it a dot belongs
 PINNED = 0.15  # spacings: how far a dot that keeps its place in the picture may seem to move on the body
 NEXT = 1.3  # breadths: how far such a dot may be from known markers
+JUMP = 0.7  # spacings: how far beside the body's motion no dot goes from picture to picture
 HOPPING, RESTING = 0.02, 0.1  # of how far a dot goes in all, and of the body's steps: its steps if it only hops
 ALIKE = 1.2  # ratio of radii within a family
 
@@ -116,7 +117,7 @@ class Newcomers:
         self._candidates = [item for item in self._candidates if item not in ready]
         newcomers: list[Newcomer] = []
         for item in ready:
-            newcomer = self._followed_back(item, pattern, parameters, SAME * spacing)
+            newcomer = self._followed_back(item, pattern, parameters, spacing)
             others = np.concatenate([pattern.rest, *(other.rest[None] for other in newcomers)])
             if newcomer is not None and np.linalg.norm(others - newcomer.rest, axis=1).min() > FREE * spacing:
                 newcomers.append(newcomer)
@@ -182,8 +183,10 @@ class Newcomers:
             return False
         return not self._admitted(fit_dots(self._first, _starts(candidate.place[-1:], parameters)))[0]
 
-    def _followed_back(self, candidate: Candidate, pattern: Pattern, parameters: Array, same: float) -> Newcomer | None:
-        """The candidate in the last pictures; None where too few of those since its first look show it."""
+    def _followed_back(
+        self, candidate: Candidate, pattern: Pattern, parameters: Array, spacing: float
+    ) -> Newcomer | None:
+        """The candidate in the last pictures; None where too few since its first look show it, or several dots."""
         always = len(self._recent[0].place)  # those known in all of the pictures: more of them put it elsewhere
         memory = Memory(np.concatenate([pattern.rest[:always], np.median(candidate.rest, axis=0)[None]]))
         carried = {then.number: _carried(memory, then, always) for then in self._recent}
@@ -204,7 +207,9 @@ class Newcomers:
             starts = np.concatenate([_starts(expected[None], parameters), _moved(parameters[near], then.place[near])])
             dots = doubted(then.image, fit_dots(then.image, starts, 1))
             miss = float(np.linalg.norm(dots.centre[0] - expected))
-            if self._admitted(dots)[0] and miss < (same if between else min(same, FARTHER * farthest + BLUR)):
+            if self._admitted(dots)[0] and miss < (
+                SAME * spacing if between else min(SAME * spacing, FARTHER * farthest + BLUR)
+            ):
                 farthest, lost, off = max(farthest, miss), 0, off + dots.centre[0] - expected
                 shown = shown if seen else dots.parameters[0]
                 seen[then.number] = dots.centre[0], dots.sigma[0]
@@ -212,8 +217,8 @@ class Newcomers:
                 lost += 1
                 if lost == LOST:
                     break
-        path = [(seen[number][0], carried[number]) for number in seen if number >= first]
-        if len(path) < max(FOUND * since, LEAST_SEEN) or _hops(*np.array(path).swapaxes(0, 1)):
+        path = np.array([(seen[number][0], carried[number]) for number in seen if number >= first]).reshape(-1, 2, 2)
+        if len(path) < max(FOUND * since, LEAST_SEEN) or _hops(path[:, 0], path[:, 1], spacing):
             return None
         home = self._home(pattern, seen)
         return None if home is None else Newcomer(*home, shown, seen)
@@ -239,11 +244,13 @@ def _carried(memory: Memory, then: _Earlier, count: int) -> Array:
     return memory.carried(place, known).place[-1]
 
 
-def _hops(found: Array, carried: Array) -> bool:
-    """Whether what was followed [px], (T, 2), is one still dot after the other.
+def _hops(found: Array, carried: Array, spacing: float) -> bool:
+    """Whether what was followed [px], (T, 2), is one dot after the other.
 
-    Then it mostly keeps its place, where the body would have carried it on, (T, 2).
+    Then it jumps from where the body would have carried it on, (T, 2), to the next; or they mostly stand still.
     """
+    if np.linalg.norm(np.diff(found - carried, axis=0), axis=1).max() > JUMP * spacing:
+        return True
     steps, body = (np.median(np.linalg.norm(np.diff(way, axis=0), axis=1)) for way in (found, carried))
     return bool(steps < HOPPING * np.linalg.norm(np.std(found, axis=0)) and steps < RESTING * body)
 
