@@ -6,11 +6,13 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated
 
+import cv2
 import numpy as np
 import typer
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
+from threadpoolctl import threadpool_limits
 
 from calibration.board import View, read_board
 from calibration.camera import Camera
@@ -204,7 +206,9 @@ def track(
     done: dict[str, Tracks] = {}
     failed: dict[str, str] = {}
     kept: list[str] = []
-    with progress() as bar, ThreadPoolExecutor(jobs or os.cpu_count() or 1) as pool:
+    cv2.setNumThreads(1)  # decoders and followers have the cores; BLAS threads that wait for work keep them busy
+    one_thread, side_by_side = threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(jobs or os.cpu_count() or 1)
+    with one_thread, progress() as bar, side_by_side as pool:
         waiting = {
             name: pool.submit(_one, out / f"{name}.h5", sources, rig, settings, bar)
             for name, sources in recordings.items()

@@ -23,6 +23,7 @@ from localisation import localisation
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from threadpoolctl import threadpool_limits
 
 warnings.filterwarnings("ignore")
 logging.getLogger("trackpy").setLevel(logging.ERROR)
@@ -47,7 +48,8 @@ def main() -> None:
     parser.add_argument("--real", type=Path, help="folder of real C3D recordings to film again")
     parser.add_argument("--out", type=Path, default=Path("build/bench-tracking.csv"))
     options = parser.parse_args()
-    cv2.setNumThreads(1)
+    cv2.setNumThreads(1)  # as the command does
+    threadpool_limits(1, user_api="blas")
     print(f"seed {options.seed}")
     rows: list[tuple[str, Row]] = []
     for section in options.only.split(","):
