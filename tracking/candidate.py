@@ -63,6 +63,10 @@ class Candidate:
             return True
         return len(self.looks) >= LONG and way > LEAST and self._sways()
 
+    def rides(self) -> bool:
+        """Whether it moves less on the body than in the picture."""
+        return _spread(self.rest) < _spread(self.place)
+
     def still(self, most: float = np.inf) -> bool:
         """Whether it keeps its place in the picture; and on the body, to at most so many [px]."""
         return len(self.looks) >= LONG and _spread(self.place) < STEADY and _spread(self.rest) < most

@@ -190,6 +190,8 @@ class Newcomers:
         always = len(self._recent[0].place)  # those known in all of the pictures: more of them put it elsewhere
         memory = Memory(np.concatenate([pattern.rest[:always], np.median(candidate.rest, axis=0)[None]]))
         carried = {then.number: _carried(memory, then, always) for then in self._recent}
+        if not candidate.rides():  # followed where it is in the picture, not where it seems to be on the body
+            carried = dict.fromkeys(carried, np.zeros(2))
         looks = [look for look in candidate.looks if look.frame in carried]
         frames, stray = [look.frame for look in looks], np.array([look.place - carried[look.frame] for look in looks])
         first = candidate.looks[0].frame

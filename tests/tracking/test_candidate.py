@@ -65,3 +65,14 @@ def test_what_rested_for_long_is_known_soon_after_it_moves() -> None:
     assert moved.carried()
     assert not moved.settled()
     assert len(moved.looks) < 50
+
+
+def test_a_dot_that_seems_to_move_more_on_the_body_than_in_the_picture_does_not_ride_on_it() -> None:
+    body = np.array([[0.0, 0.0], [20.0, 0.0]])
+    riding, beside = Candidate(), Candidate()
+    for frame in range(10):
+        way = np.array([0.0, 8.0 * np.sin(frame)])
+        riding.looks.append(Look(frame, np.array([40.0, 0.1 * frame % 2]), np.array([40.0, 0.0]) + way, body + way))
+        beside.looks.append(Look(frame, np.array([40.0, 0.0]) - way, np.array([40.0, 0.1 * frame % 2]), body + way))
+    assert riding.rides()
+    assert not beside.rides()
