@@ -1,5 +1,7 @@
 """Fitting discs to pixels: which pixels to trust, and whether the disc moved far while the shutter was open."""
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -33,6 +35,9 @@ ASKED = 0.1  # of the contrast: a residual up to which it does not matter how mu
 LIT, EXPLAINED = 0.05, 0.5  # of the light's logarithm: a change that matters; of what is strange: what is left of it
 FEW = 0.01  # of the pixels: so many may look strange by noise
 LITTLE = 0.3  # weight
+# A function that is optimised both alone and within its callers is rounded as its one or other copy has it, by whether
+# they are compiled in this process or were before; and a start's strange pixels turn on the last bit.
+AS_WRITTEN: dict[str, Any] = FAST | {"fastmath": {"nsz"}}
 BESIDE = 1.2  # standard deviations of the edge: what shows something else is blurred as well
 LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edge does not describe any more
 
@@ -208,7 +213,7 @@ def _relight(p, x0, y0, count, strange, w, H):  # type: ignore[no-untyped-def]
 @njit(**FAST)
 def _weigh_start(p, x0, y0, count, share, w, H):  # type: ignore[no-untyped-def]
     """Weights by the levels that a start expects; returns how many are small. Fills H as `normal_equations` does."""
-    strange = np.float32(0.0)
+    strange = 0
     H[:] = 0.0
     for first in range(0, count, CHUNK):
         some = filled_up(min(CHUNK, count - first))
@@ -230,7 +235,7 @@ def _noise(row, count, w):  # type: ignore[no-untyped-def]
     return 1.4826 / np.sqrt(2.0) * np.median(w[SIZE : SIZE + max(found, 1)])
 
 
-@njit(**FAST)
+@njit(**AS_WRITTEN)
 def _weigh_levels(first, count, contrast, share, w):  # type: ignore[no-untyped-def]
     """Fills a linearised chunk's weights by the levels shown, and which are flat; returns how many are small.
 
@@ -242,7 +247,7 @@ def _weigh_levels(first, count, contrast, share, w):  # type: ignore[no-untyped-
     inverse = np.float32(1.0 / share)
     scale = inverse / np.float32(abs(contrast))
     over = inverse / np.float32(contrast)
-    strange = zero
+    strange = np.int32(0)
     for k in range(count):
         step = w[J + 8 * CHUNK + k]
         away = w[J + 12 * CHUNK + k]
@@ -253,7 +258,7 @@ def _weigh_levels(first, count, contrast, share, w):  # type: ignore[no-untyped-
         weight = one / (one + z * z * z * z)
         w[SHOWN + first + k] = weight
         w[FLAT + first + k] = one if far else zero
-        strange += one if weight < np.float32(LITTLE) else zero
+        strange += np.int32(1) if weight < np.float32(LITTLE) else np.int32(0)
     return strange
 
 

@@ -1,8 +1,15 @@
 """The disc fit against a plain one, against the noise limit, and its uncertainty."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from support import picture
 
 from tracking.artificial import Scene, draw, expose
 from tracking.disc import CHUNK, PARAMETERS, SCRATCH, J, X, Y, filled_up, linearise
@@ -133,3 +140,20 @@ def test_pictures_of_more_bits_say_more() -> None:
     fine = fitted(clean.astype(np.float32), 31.0, 33.0, 8.0)
     assert np.abs(fine.centre[0] - (31.3, 32.8)).max() < 1e-3
     assert fine.sigma[0, 0] <= coarse.sigma[0, 0]
+
+
+def test_the_process_that_compiles_fits_as_those_that_load_do(tmp_path: Path) -> None:
+    """On dim dots and as many stains: what they come to turns on the last bit."""
+    skin = picture([(60.0 + 30 * k, 50.0, 6.0, 6.0, 0.0) for k in range(6)], (260, 100), noise=2.0, contrast=60.0)
+    stains = cv2.resize(np.random.default_rng(1).normal(0.0, 8.0, (12, 32)), (260, 100), interpolation=cv2.INTER_CUBIC)
+    np.save(tmp_path / "mottled.npy", np.clip(np.rint(skin + stains), 0, 255).astype(np.uint8))
+    program = (
+        "import numpy as np; from tracking.dots import candidates, fit_dots; picture = np.load('mottled.npy');"
+        "fitted = fit_dots(picture, candidates(picture, True)); print(fitted.parameters.tobytes().hex())"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(Path(__file__).parents[2])}
+    first, second = (
+        subprocess.run([sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, check=True)
+        for _ in range(2)
+    )
+    assert first.stdout == second.stdout
