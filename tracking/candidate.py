@@ -13,7 +13,7 @@ LOOKS, MOVING = 5, 0.5  # looks that show a moving dot before it is believed, an
 CARRIED = 0.5  # of that way: how far it may move on the body the while
 LONG, LEAST = 15, 0.15  # looks and px: likewise, of a dot that hardly moves
 MODES, ALONE = 2, 0.1  # ways of the body to move, and of the variance of such a dot's way: what these may not explain
-ASTRAY = 0.4  # of the way of the marker that moves most: how far it may seem to move on the body
+ASTRAY = 0.4, 0.6  # of the way of the marker that moves most: how far it may seem to move on the body; if explained
 STEADY = 1.0  # px: root mean square way of what stands still, though the camera may not
 KEPT = 40  # looks
 SEEMING = 0.3  # of how far it seems to move on the body: so much farther is a dot that keeps its place in the picture
@@ -79,13 +79,13 @@ class Candidate:
         """Whether it moves when the body moves: beside a clamp, where it moves less than the others can tell."""
         common = min(len(look.body) for look in self.looks)
         body = np.stack([look.body[:common].ravel() for look in self.looks])
-        if _spread(self.rest) > ASTRAY * np.linalg.norm(body.std(axis=0).reshape(-1, 2), axis=1).max():
-            return False
+        stray = _spread(self.rest) / np.linalg.norm(body.std(axis=0).reshape(-1, 2), axis=1).max()
         modes = np.linalg.svd(body - body.mean(axis=0), full_matrices=False)[0][:, :MODES]
         own = self.place - self.place.mean(axis=0)
         left = own - modes @ (modes.T @ own)
         free = len(self.looks) - 1
-        return bool((left**2).sum() / (free - MODES) < ALONE * (own**2).sum() / free)
+        unexplained = (left**2).sum() / (free - MODES) / ((own**2).sum() / free)
+        return bool(unexplained < ALONE * min(1.0, (ASTRAY[1] - stray) / (ASTRAY[1] - ASTRAY[0])))
 
 
 def _spread(places: Array) -> float:
