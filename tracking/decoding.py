@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
-from itertools import islice
+from itertools import islice, starmap
 from pathlib import Path
 
 import av
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from groundwork import InputError
 from tracking.ahead import ahead
-from tracking.ffmpeg import FFmpegDecoder, Outcome, opened, packets_of
+from tracking.ffmpeg import FFmpegDecoder, Outcome, luma_size, opened, packets_of
 from tracking.frame import Frame
 from tracking.hevc import HevcDecoder
 from tracking.jpeg import JpegDecoder
@@ -47,7 +47,7 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
     """
     shown: list[float] = []
     try:
-        with closing(ahead(_pieces(path, notes), lambda piece: piece.size())) as pieces:
+        with closing(_pieces(path, notes)) as pieces:
             for frame in Order().frames(pieces):
                 shown.append(frame.time)
                 yield frame
@@ -63,11 +63,34 @@ def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Ite
 
 
 def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
-    """A video file's packets and what they decode to; whatever can be left to another thread is."""
+    """A video file's packets and what they decode to, ahead in another thread."""
     with ExitStack() as stack:
         container = stack.enter_context(opened(path))
         stream = container.streams.video[0]
-        codec = stream.codec_context.codec
+        outcomes = stack.enter_context(closing(_outcomes(path, container, stream, notes)))
+        extradata = stream.codec_context.extradata
+        renewals = Renewals(Units.of("h264", extradata)) if stream.codec_context.codec.name == "h264" else None
+        for packet, frames, damaged in outcomes:
+            stamp = packet.pts if packet.size else None
+            since = (0 if packet.is_keyframe else None) if renewals is None else renewals.since(packet)
+            unstamped = packet.size > 0 and stamp is None
+            yield Piece(stamp, since is not None, float(packet.time_base), frames, damaged, since or 0, unstamped)
+
+
+def _outcomes(
+    path: Path, container: "av.container.InputContainer", stream: "av.video.stream.VideoStream", notes: list[str]
+) -> Generator[Outcome]:
+    """A file's packets and what they decode to; whatever can be left to other threads is."""
+    codec = stream.codec_context.codec
+    packets = packets_of(container, stream, notes)
+    if not codec.intra_only and codec.name != "hevc":
+        # The one decoder has a thread to itself: what else there is to do would keep it waiting.
+        decoder = FFmpegDecoder(stream)
+        decoded = ((packet, *decoder.decoded(packet)) for packet in packets)
+        with closing(ahead(decoded, lambda each: sum(map(luma_size, each[1])))) as made:
+            yield from starmap(decoder.taken, made)
+        return
+    with ExitStack() as stack:
         count = min(MOST_DECODERS, os.cpu_count() or 1, _decoders_worth(path)) if codec.intra_only else 1
         decoders: list[Decoder]
         if codec.name == "mjpeg" and (jpeg := JpegDecoder.of(path)) is not None:
@@ -79,12 +102,8 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
             streams = [stream]
             streams += [stack.enter_context(opened(path)).streams.video[0] for _ in range(1, count)]
             decoders = [FFmpegDecoder(each).decode for each in streams]
-        renewals = Renewals(Units.of("h264", stream.codec_context.extradata)) if codec.name == "h264" else None
-        for packet, frames, damaged in _all_decoded(packets_of(container, stream, notes), decoders):
-            stamp = packet.pts if packet.size else None
-            since = (0 if packet.is_keyframe else None) if renewals is None else renewals.since(packet)
-            unstamped = packet.size > 0 and stamp is None
-            yield Piece(stamp, since is not None, float(packet.time_base), frames, damaged, since or 0, unstamped)
+        outcomes = _all_decoded(packets, decoders)
+        yield from stack.enter_context(closing(ahead(outcomes, lambda each: sum(frame.size() for frame in each[1]))))
 
 
 def _decoders_worth(path: Path) -> int:
@@ -94,7 +113,7 @@ def _decoders_worth(path: Path) -> int:
         return 1 + (0 if first is None else first.size // BYTES_EACH)
 
 
-def _all_decoded(packets: Iterator["av.packet.Packet"], decoders: list[Decoder]) -> Iterator[Outcome]:
+def _all_decoded(packets: Iterator["av.packet.Packet"], decoders: list[Decoder]) -> Generator[Outcome]:
     """What comes of packets, in their order."""
     handfuls = iter(lambda: list(islice(packets, TOGETHER)), [])
     if len(decoders) == 1:

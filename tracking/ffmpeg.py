@@ -46,13 +46,10 @@ class FFmpegDecoder:
     def decode(self, packets: list["av.packet.Packet"]) -> list[Outcome]:
         """The next packets, each with the frames that it completes, and whether it is damaged."""
         # First all decoding, then all else: each time the one has driven the other's code out of the caches.
-        decoded = [(packet, *self.decoded(packet)) for packet in packets]
-        return [(each[0], *self._taken(*each)) for each in decoded]
+        return [self.taken(*each) for each in [(packet, *self.decoded(packet)) for packet in packets]]
 
-    def _taken(
-        self, packet: "av.packet.Packet", frames: list["av.VideoFrame"], complained: bool
-    ) -> tuple[list[Decoded], bool]:
-        """What is needed of a packet's frames, and whether it is damaged."""
+    def taken(self, packet: "av.packet.Packet", frames: list["av.VideoFrame"], complained: bool) -> Outcome:
+        """What is needed of the next packet's frames, in whatever thread, and whether it is damaged."""
         if self.coarseness is not None:
             self.coarseness.look(packet)
         if self.watched:
@@ -70,7 +67,7 @@ class FFmpegDecoder:
             self.number += 1
             if costly:
                 gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
-        return taken, complained
+        return packet, taken, complained
 
     def decoded(self, packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
         """FFmpeg's frames, and whether it complained."""
@@ -81,6 +78,11 @@ class FFmpegDecoder:
                 return [], True
         complaints = any(level <= av.logging.ERROR for level, _, _ in messages)
         return frames, complaints or packet.is_corrupt
+
+
+def luma_size(frame: "av.VideoFrame") -> int:
+    """Of a frame's first plane [bytes]."""
+    return int(frame.planes[0].buffer_size)
 
 
 def opened(path: Path) -> "av.container.InputContainer":

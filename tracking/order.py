@@ -28,6 +28,10 @@ class Decoded:
     picture: NDArray | None
     steps: NDArray | None
 
+    def size(self) -> int:
+        """Of the picture [bytes]."""
+        return 0 if self.picture is None else self.picture.nbytes
+
 
 @dataclass(frozen=True)
 class Piece:
@@ -50,10 +54,6 @@ class Piece:
     complained: bool
     since: int = 0
     unstamped: bool = False
-
-    def size(self) -> int:
-        """Of its pictures [bytes]."""
-        return sum(frame.picture.nbytes for frame in self.frames if frame.picture is not None)
 
 
 @dataclass(frozen=True)
