@@ -118,10 +118,11 @@ class Others:
         frames = np.flatnonzero(seen[:, markers].all(axis=1)) if len(markers) else np.zeros(0, int)
         if len(frames) < FEW_FRAMES or len(markers) < FEW_MARKERS:
             return None
-        path = pixel[np.ix_(frames, markers)]
+        where = _where(frames, markers, pixel)
+        path = pixel[where]
         path = (path - path.mean(axis=0)).reshape(len(frames), -1)
         product = path.T @ path
-        noise = (sigma[np.ix_(frames, markers)] ** 2).mean(axis=(0, 2))
+        noise = (sigma[where] ** 2).mean(axis=(0, 2))
         most = min(MODES, len(frames) // 4, len(markers) // 2)
         square, modes = np.linalg.eigh(product)  # ascending
         if (len(frames) < FEWEST_FRAMES or len(markers) < FEWEST_MARKERS) and _count_modes(square, len(frames)) > most:
@@ -154,6 +155,13 @@ class Others:
     def missed(self) -> Array:
         """Mean square of what the others' motion leaves of each path, as if it had not been fitted [px^2], (M, 2)."""
         return (self.away**2 * (1.0 - self.leverage[..., None])).mean(axis=0)
+
+
+def _where(frames: NDArray[np.int64], markers: NDArray[np.int64], whole: Array) -> tuple[Any, Any]:
+    """Index of these frames and markers of an array (T, D, ...), which copies nothing where they are all there are."""
+    if (len(frames), len(markers)) == whole.shape[:2]:
+        return slice(None), slice(None)
+    return np.ix_(frames, markers)
 
 
 def _count_modes(square: Array, frames: int) -> int:
@@ -193,7 +201,7 @@ def with_shared_errors(sigma: Array, others: Others) -> Array:
 
     A few places that are far off tell of themselves only.
     """
-    where = np.ix_(others.frames, others.markers)
+    where = _where(others.frames, others.markers, sigma)
     own = (sigma[where] ** 2).mean(axis=0)
     square = others.away**2 * (1.0 - others.leverage[..., None])
     near = np.minimum(square, OUTLYING**2 * np.median(square, axis=0))
@@ -220,7 +228,7 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others, coarse:
         others: motion of these paths.
         coarse: as `step_over_noise` has it.
     """
-    where = np.ix_(others.frames, others.markers)
+    where = _where(others.frames, others.markers, pixel)
     square, shown = coding[where] ** 2, fitted[where] ** 2
     usual = np.maximum(square.mean(axis=0), 1e-12).sum(axis=1, keepdims=True)
     way = np.pad((np.diff(pixel, axis=0) ** 2).sum(axis=2), ((1, 1), (0, 0)), constant_values=np.nan)
