@@ -157,7 +157,7 @@ class Others:
         return (self.away**2 * (1.0 - self.leverage[..., None])).mean(axis=0)
 
 
-def _where(frames: NDArray[np.int64], markers: NDArray[np.int64], whole: Array) -> tuple[Any, Any]:
+def _where(frames: NDArray[np.int64], markers: NDArray[np.int64], whole: Array) -> tuple[Any, ...]:
     """Index of these frames and markers of an array (T, D, ...), which copies nothing where they are all there are."""
     if (len(frames), len(markers)) == whole.shape[:2]:
         return slice(None), slice(None)
