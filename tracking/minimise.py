@@ -35,6 +35,10 @@ WORTHLESS = 0.4  # of a pixel's mean squared residual: a gain that says nothing 
 LONGEST = 0.2  # of the radius' square: what W's variance along a large dot's way may be beyond `MOST_BLUR`
 MUCH = 0.1  # damping of the last try, that holds back what the pixels hardly tell and leaves the centre its step
 LEVEL = 1e-3  # of the squared residual: as much as before, but for rounding
+# A step that short [px], after another small one, is the last though the squared residual be larger by that share than
+# before: derivatives leave out how light that falls off and an edge blurred along one way change them, so that where an
+# outline drawn by hand leaves much residual, no step is left where it is not quite the least.
+RESTING, RISEN = 0.02, 1e-2
 DOUBTED = 0.9  # weight: below it a pixel is not quite trusted
 BLOCK = 4  # px: errors closer than this are not taken to be independent
 
@@ -200,12 +204,13 @@ def minimise(p, instants, x0, y0, count, w, H, L, quality):  # type: ignore[no-u
         trial[:] = p + step
         _keep_possible(trial, instants)
         length = max(abs(step[0]), abs(step[1]))
-        last = _is_last(length, gain, best, count)
-        if not (damping < LITTLE and (last or _is_close(p, step))):
+        last, close = _is_last(length, gain, best, count), _is_close(p, step)
+        if not (damping < LITTLE and (last or close)):
             continue
         settled[:] = trial
         length, cost, gain = _assess(trial, instants, x0, y0, count, w, L, quality)
-        if cost < best * (1.0 + LEVEL) and (last or _is_last(length, gain, cost, count)):
+        risen = RISEN if close and length < RESTING else LEVEL
+        if cost < best * (1.0 + risen) and (last or _is_last(length, gain, cost, count)):
             p[:] = trial
             return True
         trial[:] = settled

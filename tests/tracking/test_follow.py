@@ -287,7 +287,7 @@ def test_stains_of_the_skin_are_no_markers() -> None:
     """Dim dots on a skin so mottled that it shows more round stains than there are dots."""
     dots = 100 + grid()
     false = 0
-    for seed in range(6):
+    for seed in range(12):
         random = np.random.default_rng(seed)
         skin = picture([(x, y, 6.0, 6.0, 0.0) for x, y in dots], (640, 480), noise=2.0, seed=seed, contrast=60.0)
         mottled = skin + cv2.resize(random.normal(0.0, 8.0, (62, 82)), (640, 480), interpolation=cv2.INTER_CUBIC)
@@ -296,7 +296,7 @@ def test_stains_of_the_skin_are_no_markers() -> None:
         away = np.linalg.norm(found[1].centre[:, None] - dots, axis=2)
         assert away.min(axis=0).max() < 1.0  # what lies around a dot pulls it
         false += len(found[1]) - 24
-    assert false <= 4
+    assert false <= 14  # of 100 stains and more that look round
 
 
 @pytest.mark.parametrize("row", [80, 114, 182])
