@@ -9,11 +9,16 @@ export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking bench-paper bench-capture bench-sim2real clean
 
-install: $(VENV)/installed
+install: $(VENV)/installed $(VENV)/kernels
 
 $(VENV)/installed: pyproject.toml constraints.txt
 	python3 -m venv $(VENV) || (echo "the venv module is missing: apt-get install python3-venv" && false)
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	touch $@
+
+# A compiled kernel that is kept does not know that one which it calls has changed in another file.
+$(VENV)/kernels: $(VENV)/installed $(wildcard capture/*.py calibration/*.py rafl/*.py tracking/*.py)
+	find capture calibration rafl tracking -name '*.nb[ci]' -delete
 	touch $@
 
 # From a simulated specimen on film to a fitted model, by the commands a lab types.
