@@ -79,13 +79,14 @@ class Candidate:
         """Whether it moves when the body moves: beside a clamp, where it moves less than the others can tell."""
         common = min(len(look.body) for look in self.looks)
         body = np.stack([look.body[:common].ravel() for look in self.looks])
-        stray = _spread(self.rest) / np.linalg.norm(body.std(axis=0).reshape(-1, 2), axis=1).max()
+        most = np.linalg.norm(body.std(axis=0).reshape(-1, 2), axis=1).max()
         modes = np.linalg.svd(body - body.mean(axis=0), full_matrices=False)[0][:, :MODES]
         own = self.place - self.place.mean(axis=0)
         left = own - modes @ (modes.T @ own)
         free = len(self.looks) - 1
         unexplained = (left**2).sum() / (free - MODES) / ((own**2).sum() / free)
-        return bool(unexplained < ALONE * min(1.0, (ASTRAY[1] - stray) / (ASTRAY[1] - ASTRAY[0])))
+        span = (ASTRAY[1] - ASTRAY[0]) * most
+        return bool(unexplained * span < ALONE * min(span, ASTRAY[1] * most - _spread(self.rest)))
 
 
 def _spread(places: Array) -> float:

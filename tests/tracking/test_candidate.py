@@ -42,6 +42,14 @@ def test_the_farther_it_seems_to_stray_the_more_of_its_way_the_body_must_explain
     assert not candidate(close, 1.5 * rest).carried()
 
 
+def test_beside_a_body_that_keeps_still_nothing_is_carried() -> None:
+    random = np.random.default_rng(7)
+    item = Candidate()
+    for frame in range(20):
+        item.looks.append(Look(frame, np.zeros(2), random.normal(0.0, 0.3, 2), np.array([[0.0, 0.0], [30.0, 0.0]])))
+    assert not item.carried()
+
+
 def test_what_is_carried_far_is_known_after_a_few_looks() -> None:
     random = np.random.default_rng(1)
     place = swing(6)[:, 5] + [30.0, 0.0]
