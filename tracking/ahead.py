@@ -8,58 +8,51 @@ from typing import TypeVar
 
 Thing = TypeVar("Thing")
 
-# Pictures decoded before they are asked for, as the first takes its time: how many handfuls of how many bytes. Two
-# threads that wait for each other at every picture lose a twentieth of their time.
-HANDFULS, HANDFUL = 12, 2**22
+AHEAD = 48 * 2**20  # bytes of pictures decoded before they are asked for, as the first takes its time
 LEAST = 2**18  # bytes that a thing counts for
 
 
 def ahead(source: Generator[Thing], size_of: Callable[[Thing], int]) -> Generator[Thing]:
-    """The same things, made in a thread of their own and handed over by the handful.
+    """The same things, made in a thread of their own.
+
+    Each is handed over at once: where many were on their way, the processor's cache would not hold them all, and
+    whoever makes the next would wait for memory.
 
     Args:
         source: makes them.
         size_of: one of them [bytes].
     """
-    made: queue.Queue[list[Thing] | BaseException | None] = queue.Queue(HANDFULS)
-    stopped = threading.Event()
-
-    def put(item: list[Thing] | BaseException | None) -> None:
-        while not stopped.is_set():
-            try:
-                made.put(item, timeout=0.2)
-            except queue.Full:
-                continue
-            return
+    # These queues are far quicker than those that have a length: decoding hardly notices them.
+    made: queue.SimpleQueue[tuple[list[Thing], int] | Exception | None] = queue.SimpleQueue()
+    taken: queue.SimpleQueue[int | None] = queue.SimpleQueue()  # bytes; None where no more is wanted
 
     def work() -> None:
-        handful: list[Thing] = []
-        size = 0
+        room = AHEAD
         try:
             with closing(source):
                 for thing in source:
-                    handful.append(thing)
-                    size += max(size_of(thing), LEAST)
-                    if size >= HANDFUL:
-                        put(handful)
-                        handful, size = [], 0
-                    if stopped.is_set():
-                        return
-            put(handful)
-            put(None)
+                    size = max(size_of(thing), LEAST)
+                    made.put(([thing], size))
+                    del thing
+                    room -= size
+                    while room < 0 or not taken.empty():
+                        back = taken.get()
+                        if back is None:
+                            return
+                        room += back
+            made.put(None)
         except Exception as error:  # handed to whoever reads
-            put(handful)
-            put(error)
+            made.put(error)
 
     thread = threading.Thread(target=work, daemon=True)
     thread.start()
     try:
         while (item := made.get()) is not None:
-            if isinstance(item, BaseException):
+            if isinstance(item, Exception):
                 raise item
-            item.reverse()
-            while item:
-                yield item.pop()  # and keeps no picture that nobody else does
+            things, size = item
+            taken.put(size)
+            yield things.pop()  # and keeps no picture that nobody else does
     finally:
-        stopped.set()
+        taken.put(None)
         thread.join()
