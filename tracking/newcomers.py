@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
@@ -23,7 +24,8 @@ from tracking.shape import NEIGHBOURS, Pattern
 
 Array = NDArray[Any]
 
-EVERY, SOON = 12, 2  # frames from look to look; where the last one showed a dot that may be one
+# Frames from look to look; where the last one showed a dot that may be one; and where all that it showed keep still.
+EVERY, SOON, SELDOM = 4, 2, 12
 KEPT, MOST_BYTES = 60, 2**28  # last pictures, in which a dot is followed back, and their size together
 FREE = 0.55  # spacings: how far on the body from known markers there may be another
 FAR = 2.4  # breadths: how far from them at most
@@ -101,7 +103,7 @@ class Newcomers:
         now = _Earlier(number, image, place, seen & ~marks)
         self._recent.append(now)
         self._first = image if self._first is None else self._first
-        most = KEPT if self._candidates else EVERY  # fresh memory is slow
+        most = KEPT if self._candidates else EVERY  # few: decoding is slower in memory that no cache holds
         while len(self._recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
             self._recent.popleft()
         if number < self._due or 2 * now.body.sum() < (~marks).sum():
@@ -111,7 +113,8 @@ class Newcomers:
         own = self._at_rest(pattern, now, found).place
         near = np.linalg.norm(own[:, None] - pattern.rest[now.body], axis=2).min(axis=1) < FAR * breadth
         self._count(now, own[near], found[near], NEAR * spacing)
-        self._due = number + (EVERY if all(item.settled() for item in self._candidates) else SOON)
+        settled = all(item.settled() for item in self._candidates)
+        self._due = number + (EVERY if not self._candidates else SELDOM if settled else SOON)
         rest = pattern.rest[~marks]
         ready = [item for item in self._candidates if item.carried() or self._stands(item, rest, parameters, spacing)]
         self._candidates = [item for item in self._candidates if item not in ready]
@@ -264,14 +267,28 @@ def _bent(rest: Array, place: Array) -> float:
     return float(np.sqrt((np.abs(left) ** 2).mean()))
 
 
-def _breadth(rest: Array) -> float:
-    """How far apart the markers' lines are: the usual distance to the nearest that is not in line with the nearest."""
-    way = rest[:, None] - rest[None]
-    distance = np.linalg.norm(way, axis=2) + np.where(np.eye(len(rest), dtype=bool), np.inf, 1e-9)
-    nearest = way[np.arange(len(rest)), distance.argmin(axis=1)] / distance.min(axis=1)[:, None]
-    sine = np.abs(way[..., 0] * nearest[:, None, 1] - way[..., 1] * nearest[:, None, 0]) / distance
-    beside = np.where(sine > BESIDE, distance, np.inf).min(axis=1)
-    return float(np.median(np.where(beside < np.inf, beside, distance.min(axis=1))))
+@njit(cache=True)
+def _breadth(rest):  # type: ignore[no-untyped-def]
+    """How far apart the lines of markers (M, 2) are.
+
+    The usual distance to the nearest that is not in line with the nearest.
+    """
+    count = len(rest)
+    breadths = np.empty(count)
+    for k in range(count):
+        ways = rest - rest[k]
+        distance = np.hypot(ways[:, 0], ways[:, 1])
+        distance[k] = np.inf
+        nearest = np.argmin(distance)
+        along = ways[nearest] / max(distance[nearest], 1e-9)
+        breadths[k] = np.inf
+        for other in range(count):
+            sine = abs(along[0] * ways[other, 1] - along[1] * ways[other, 0]) / max(distance[other], 1e-9)
+            if other != k and sine > BESIDE:
+                breadths[k] = min(breadths[k], distance[other])
+        if breadths[k] == np.inf:
+            breadths[k] = distance[nearest]
+    return np.median(breadths)
 
 
 def _starts(places: Array, parameters: Array) -> Array:
