@@ -25,8 +25,9 @@ from tracking.shape import NEIGHBOURS, Pattern
 Array = NDArray[Any]
 
 # Frames from look to look; where the last one showed a dot that may be one; and where all that it showed keep still.
-EVERY, SOON, SELDOM = 4, 2, 12
-KEPT, MOST_BYTES = 60, 2**28  # last pictures, in which a dot is followed back, and their size together
+EVERY, SOON, SELDOM = 3, 2, 12
+# Last pictures kept, in which candidates are followed back, and their size together; and while there is no candidate.
+KEPT, MOST_BYTES, CALMLY = 60, 2**28, 2
 FREE = 0.55  # spacings: how far on the body from known markers there may be another
 FAR = 2.4  # breadths: how far from them at most
 BESIDE = 0.5  # sine of the angle from the line to its nearest neighbour, from which on one stands beside a marker
@@ -103,13 +104,16 @@ class Newcomers:
         now = _Earlier(number, image, place, seen & ~marks)
         self._recent.append(now)
         self._first = image if self._first is None else self._first
-        most = KEPT if self._candidates else EVERY  # few: decoding is slower in memory that no cache holds
+        most = KEPT if self._candidates else CALMLY  # few: decoding is slower in memory that no cache holds
         while len(self._recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
             self._recent.popleft()
         if number < self._due or 2 * now.body.sum() < (~marks).sum():
             return []
         spacing, breadth = float(np.median(pattern.spacing)), _breadth(pattern.rest[now.body])
-        found = self._strangers(image, place, FAR * breadth, pattern, parameters)
+        found = self._strangers(image, place, FAR * breadth, 0.5 * FREE * spacing, parameters)
+        if not len(found) and not self._candidates:
+            self._due = number + EVERY
+            return []
         own = self._at_rest(pattern, now, found).place
         near = np.linalg.norm(own[:, None] - pattern.rest[now.body], axis=2).min(axis=1) < FAR * breadth
         self._count(now, own[near], found[near], NEAR * spacing)
@@ -127,14 +131,13 @@ class Newcomers:
         self.unsure = np.append(self.unsure, [newcomer.sigma for newcomer in newcomers])
         return newcomers
 
-    def _strangers(self, image: NDArray, place: Array, reach: float, pattern: Pattern, parameters: Array) -> Array:
-        """Dots of the family within reach [px] of the body that are no known marker's [px], (D, 2)."""
-        spacing = float(np.median(pattern.spacing))
+    def _strangers(self, image: NDArray, place: Array, reach: float, free: float, parameters: Array) -> Array:
+        """Dots of the family within reach [px] of the body that are no known marker's, so not near one, (D, 2)."""
         low, high = place.min(0) - reach, place.max(0) + reach
         region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
         spots = find_spots(image, self.family.radius, self.family.least(self.family.contrast), region)
         away = np.linalg.norm(spots[:, None] - place[None], axis=2).min(axis=1, initial=np.inf)
-        strange = spots[away > 0.5 * FREE * spacing]
+        strange = spots[away > free]
         if not len(strange):
             return np.empty((0, 2))
         starts = _starts(strange, parameters)
