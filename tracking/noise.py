@@ -55,11 +55,12 @@ def places_and_errors(pixel: Array, fitted: Array, leverage: Array, step: Array)
     others = Others.of(pixel, np.maximum(fitted, PASSING * coding))
     if others is None:
         return pixel, expected
-    whole = with_shared_errors(expected, others)
     if not others.are_many:
-        return pixel, whole
+        return pixel, with_shared_errors(expected, others)
     off, mended = mendable(pixel, fitted, coding, others, step_over_noise(fitted, leverage, step))
-    return pixel - off, np.where(np.isnan(mended), whole, mended)
+    if np.isnan(mended).any():
+        mended = np.where(np.isnan(mended), with_shared_errors(expected, others), mended)
+    return pixel - off, mended
 
 
 def coding_errors(pixel: Array, fitted: Array, leverage: Array, step: Array) -> Array:
@@ -122,7 +123,7 @@ class Others:
         path = pixel[where]
         path = (path - path.mean(axis=0)).reshape(len(frames), -1)
         product = path.T @ path
-        noise = (sigma[where] ** 2).mean(axis=(0, 2))
+        noise = (sigma[where] ** 2).mean(axis=0).mean(axis=1)
         most = min(MODES, len(frames) // 4, len(markers) // 2)
         square, modes = np.linalg.eigh(product)  # ascending
         if (len(frames) < FEWEST_FRAMES or len(markers) < FEWEST_MARKERS) and _count_modes(square, len(frames)) > most:
@@ -231,7 +232,8 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others, coarse:
     where = _where(others.frames, others.markers, pixel)
     square, shown = coding[where] ** 2, fitted[where] ** 2
     usual = np.maximum(square.mean(axis=0), 1e-12).sum(axis=1, keepdims=True)
-    way = np.pad((np.diff(pixel, axis=0) ** 2).sum(axis=2), ((1, 1), (0, 0)), constant_values=np.nan)
+    x, y = np.moveaxis(np.diff(pixel, axis=0), 2, 0)
+    way = np.pad(x**2 + y**2, ((1, 1), (0, 0)), constant_values=np.nan)
     way = np.nan_to_num(np.fmax(way[:-1], way[1:])[where])[..., None]  # to this frame or the next
     waiting = usual / (usual + np.maximum(way - usual, 0.0) / SLOW**2)  # 1 where a marker keeps still, 0 where it flies
     alone = 1.0 / (1.0 + SHARED * coarse**2 * np.exp(WAITING * waiting))
@@ -251,7 +253,7 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others, coarse:
     # Where the others leave less of all paths together than these errors would be, the errors are smaller; but for
     # markers that keep still, whose errors keep still with them and are not seen.
     left = (others.missed / (1.0 + others.carried)).mean(axis=0)
-    smaller = np.minimum(left / np.maximum(own.mean(axis=(0, 1)), 1e-12), 1.0)
+    smaller = np.minimum(left / np.maximum(own.mean(axis=0).mean(axis=0), 1e-12), 1.0)
     smaller = waiting + (1.0 - waiting) * smaller
     # What a path has beyond them may be its own motion, where it was drawn away from it, or error, where it was not.
     kept = (1.0 - part) ** 2 * (smaller * own + beyond)
