@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 import traceback
+from collections.abc import Callable
 from pathlib import Path
 
 import av
@@ -85,6 +86,24 @@ def test_two_at_once(lab: Path) -> None:
     track(lab, "afresh")
     assert content(lab / "tracks") == content(lab / "afresh")
     assert not [path for path in (lab / "tracks").iterdir() if path.name.startswith(".")]
+
+
+def test_who_is_stopped_gives_up_what_runs_and_what_waits(lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun: list[float] = []
+
+    def endless(_videos: object, _rig: object, _settings: object, tick: Callable[[], None]) -> None:
+        begun.append(time.monotonic())
+        if len(begun) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        while time.monotonic() < begun[0] + 60.0:
+            tick()
+            time.sleep(0.01)
+
+    monkeypatch.setattr("tracking.cli.track_recording", endless)
+    result = CliRunner().invoke(track_app, command(lab))
+    assert time.monotonic() < begun[0] + 30.0
+    assert (result.exit_code, len(begun)) == (130, 2)
+    assert not (lab / "tracks").exists()
 
 
 @pytest.mark.parametrize("name", ["calib.yaml", "specimen.yaml", "videos/take1.mp4"])

@@ -1,7 +1,10 @@
 """The commands `rafl-calibrate` and `rafl-track`."""
 
 import os
-from concurrent.futures import ThreadPoolExecutor
+import threading
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Annotated
@@ -207,10 +210,10 @@ def track(
     failed: dict[str, str] = {}
     kept: list[str] = []
     cv2.setNumThreads(1)  # decoders and followers have the cores; BLAS threads that wait for work keep them busy
-    one_thread, side_by_side = threadpool_limits(1, user_api="blas"), ThreadPoolExecutor(jobs or os.cpu_count() or 1)
-    with one_thread, progress() as bar, side_by_side as pool:
+    one_thread = threadpool_limits(1, user_api="blas")
+    with one_thread, progress() as bar, _side_by_side(jobs or os.cpu_count() or 1) as (pool, stopped):
         waiting = {
-            name: pool.submit(_one, out / f"{name}.h5", sources, rig, settings, bar)
+            name: pool.submit(_one, out / f"{name}.h5", sources, rig, settings, bar, stopped)
             for name, sources in recordings.items()
         }
         for name, future in waiting.items():
@@ -248,8 +251,25 @@ def track(
         raise typer.Exit(1)
 
 
+@contextmanager
+def _side_by_side(jobs: int) -> Iterator[tuple[ThreadPoolExecutor, threading.Event]]:
+    """Threads for so many jobs, and what tells these to give up: that whoever waits for them was stopped."""
+    stopped = threading.Event()
+    pool = ThreadPoolExecutor(jobs)
+    try:
+        yield pool, stopped
+    finally:
+        stopped.set()
+        pool.shutdown(cancel_futures=True)
+
+
 def _one(
-    path: Path, sources: dict[str, Video], rig: Rig, settings: TrackingSettings, bar: Progress
+    path: Path,
+    sources: dict[str, Video],
+    rig: Rig,
+    settings: TrackingSettings,
+    bar: Progress,
+    stopped: threading.Event,
 ) -> tuple[Tracks, bool]:
     """Tracks of one recording, and whether they were there already."""
     before = finished(path, sources, rig, settings)
@@ -257,8 +277,14 @@ def _one(
         return before, True
     total = sum(video.frames for video in sources.values())
     task = bar.add_task(path.stem, total=total or None)
+
+    def tick() -> None:
+        if stopped.is_set():
+            raise CancelledError
+        bar.advance(task)
+
     try:
-        tracks = track_recording(sources, rig, settings, lambda: bar.advance(task))
+        tracks = track_recording(sources, rig, settings, tick)
         write_tracks(path, tracks)
         return tracks, False
     finally:
