@@ -39,7 +39,7 @@ FOUND, LEAST_SEEN = 0.8, 3  # of the pictures since its first look, and how many
 FEWEST = 3  # markers of the body that tell where on it a dot belongs
 PINNED = 0.15  # spacings: how far a dot that keeps its place in the picture may seem to move on the body
 NEXT = 1.3  # breadths: how far such a dot may be from known markers
-JUMP = 0.7  # spacings: how far beside the body's motion no dot goes from picture to picture
+JUMP = 0.5  # spacings: how far beside the body's motion no dot goes from picture to picture
 HOPPING, RESTING = 0.02, 0.1  # of how far a dot goes in all, and of the body's steps: its steps if it only hops
 ALIKE = 1.2  # ratio of radii within a family
 
