@@ -29,8 +29,8 @@ HARM = {"hevc": (0.13, 1.48), "av1": (4.0, 0.4), "vp9": (0.64, 0.85), "mpeg4": (
 SEARCHED = re.compile(rb"x26([45]) [(-].{,1500}? subme=(\d{1,2}) ", re.DOTALL)
 COARSER = {b"4": ((2, 2.4), (6, 1.4)), b"5": ((0, 2.3), (1, 1.4))}
 # Frames of which one is asked how it was coded, and fewer once so many have passed; kinds of frames come in fours and
-# twelves. Each answer takes as long as a third of a frame.
-ASKED, LATER, MANY = 7, 59, 70
+# twelves. Each answer takes as long as a third of a frame; a dozen are too few to tell the usual step of a short film.
+ASKED, LATER, MANY = 5, 113, 100
 FIELDS = re.compile(r"\b(\w+_parameter_set_id|init_qp_minus26|slice_qp_delta|base_q_idx) .*= (-?\d+)\s*$")
 
 
