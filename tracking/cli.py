@@ -1,6 +1,7 @@
 """The commands `rafl-calibrate` and `rafl-track`."""
 
 import os
+import sys
 import threading
 from collections.abc import Iterator
 from concurrent.futures import CancelledError, ThreadPoolExecutor
@@ -36,6 +37,7 @@ from tracking.tracks import Tracks, write_tracks
 from tracking.video import Video
 
 MODELS = ("orthographic", "pinhole")
+SOON = 1e-4  # s after which a thread that needs the interpreter has it: while a decoder waits, nothing is decoded
 
 calibrate_app = command_line("Calibrate cameras.")
 track_app = command_line("Follow dots in videos.")
@@ -210,6 +212,7 @@ def track(
     failed: dict[str, str] = {}
     kept: list[str] = []
     cv2.setNumThreads(1)  # decoders and followers have the cores; BLAS threads that wait for work keep them busy
+    sys.setswitchinterval(SOON)
     one_thread = threadpool_limits(1, user_api="blas")
     with one_thread, progress() as bar, _side_by_side(jobs or os.cpu_count() or 1) as (pool, stopped):
         waiting = {

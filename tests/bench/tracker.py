@@ -8,6 +8,7 @@ Every row says what is asked and what was found; places are known to 1e-4 px.
 import argparse
 import csv
 import logging
+import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,6 +25,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from threadpoolctl import threadpool_limits
+
+from tracking.cli import SOON
 
 warnings.filterwarnings("ignore")
 logging.getLogger("trackpy").setLevel(logging.ERROR)
@@ -50,6 +53,7 @@ def main() -> None:
     options = parser.parse_args()
     cv2.setNumThreads(1)  # as the command does
     threadpool_limits(1, user_api="blas")
+    sys.setswitchinterval(SOON)
     print(f"seed {options.seed}")
     rows: list[tuple[str, Row]] = []
     for section in options.only.split(","):
