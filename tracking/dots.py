@@ -25,7 +25,7 @@ LEAST_SIGMA = 1e-3  # px: below it the model's own error counts
 SHARED_NOISE = 1.25  # variance by blocks over that by independent errors, beyond which errors are shared
 ENOUGH_FOR_TWO = 64  # dots, to fit half of them in another thread; with fewer, decoding takes longer than fitting
 FIGURES = 10  # of a dot, that follow from its fit
-SMALL = 1.9  # px: radius of dots that are still found in a picture made small
+SMALL = 1.9  # px: radius of dots that are still found in a picture made small in a hurry
 SAME_PLACE = 0.6  # radii: two dots closer than this are one
 SHADES = 0.2  # of a shade's logarithm: dots that differ by less may be alike, however much light falls on them
 
@@ -286,6 +286,13 @@ def apart(dots: Dots, nearest: float) -> Dots:
 
 
 def _shrunk(image: NDArray[np.uint8], shrink: int) -> NDArray[np.uint8]:
+    """A picture so many times smaller."""
+    height, width = (side // shrink for side in image.shape)
+    part = image[: height * shrink, : width * shrink]
+    return cv2.resize(part, (width, height), interpolation=cv2.INTER_AREA) if shrink > 1 else part
+
+
+def _halved(image: NDArray[np.uint8], shrink: int) -> NDArray[np.uint8]:
     """A picture 1, 2 or 4 times smaller.
 
     It is halved again and again, which takes a fraction of the time of another ratio; of a picture that is halved more
@@ -299,7 +306,9 @@ def _shrunk(image: NDArray[np.uint8], shrink: int) -> NDArray[np.uint8]:
     return small
 
 
-def find_spots(image: NDArray, radius: float, least: float, region: tuple[int, int, int, int]) -> Array:
+def find_spots(
+    image: NDArray, radius: float, least: float, region: tuple[int, int, int, int], hurried: bool = False
+) -> Array:
     """Where dots of a known radius may be, quickly, to half a radius or so, (D, 2).
 
     Args:
@@ -307,13 +316,14 @@ def find_spots(image: NDArray, radius: float, least: float, region: tuple[int, i
         radius: of the dots [px].
         least: what they must stand out by, negative for dark dots [grey levels].
         region: left, top, right, bottom of where to look [px].
+        hurried: in half the time; of blurred dots side by side one may be overlooked.
     """
     left, top = max(region[0], 0), max(region[1], 0)
     part = eight_bits(image[top : max(region[3], 0), left : max(region[2], 0)])
-    shrink = next((factor for factor in (4, 2) if radius >= SMALL * factor), 1)
+    shrink = next((factor for factor in (4, 2) if radius >= SMALL * factor), 1) if hurried else max(int(radius / 3), 1)
     if min(part.shape) < 3 * shrink:
         return np.zeros((0, 2))
-    small = _shrunk(part, shrink)
+    small = _halved(part, shrink) if hurried else _shrunk(part, shrink)
     signed = small if least > 0 else 255 - small
     inner, outer = (int(factor * radius / shrink) | 1 for factor in (1.3, 4.5))
     level = cv2.boxFilter(signed, cv2.CV_32F, (outer, outer), borderType=cv2.BORDER_REFLECT)

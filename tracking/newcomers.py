@@ -135,7 +135,7 @@ class Newcomers:
         """Dots of the family within reach [px] of the body that are no known marker's, so not near one, (D, 2)."""
         low, high = place.min(0) - reach, place.max(0) + reach
         region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-        spots = find_spots(image, self.family.radius, self.family.least(self.family.contrast), region)
+        spots = find_spots(image, self.family.radius, self.family.least(self.family.contrast), region, hurried=True)
         away = np.linalg.norm(spots[:, None] - place[None], axis=2).min(axis=1, initial=np.inf)
         strange = spots[away > free]
         if not len(strange):

@@ -103,12 +103,13 @@ def test_neighbours_do_not_pull() -> None:
         assert dots.centre[nearest(dots, (x, y))] == pytest.approx((x, y), abs=0.03)
 
 
+@pytest.mark.parametrize("hurried", [False, True])
 @pytest.mark.parametrize("radius", [4.0, 8.0, 15.0, 24.0])
-def test_a_dot_is_one_spot(radius: float) -> None:
+def test_a_dot_is_one_spot(radius: float, hurried: bool) -> None:
     """Wherever it lies between the pixels of the shrunken picture, in which two of them may be equally dark."""
     for shift in np.arange(0.0, 8.0, 0.5):
         truth = [(80.0 + shift, 80.0, radius, radius, 0.0), (80.0 + shift + 2.2 * radius, 80.0, radius, radius, 0.0)]
-        spots = find_spots(picture(truth), radius, -39.0, (0, 0, 200, 160))
+        spots = find_spots(picture(truth), radius, -39.0, (0, 0, 200, 160), hurried)
         assert len(spots) == 2
         for x, y, *_ in truth:
             assert np.linalg.norm(spots - (x, y), axis=1).min() < 0.7 * radius
