@@ -31,6 +31,7 @@ STRAY = 0.33  # spacings: how far from its prediction a dot found there may be
 SEED_REACH = 2.2  # spacings: how far from where it is expected a marker may be
 ENOUGH = 0.7  # of the markers, of which the pattern alone tells which they are
 ANCHORED = 0.5  # spacings: surprise up to which a marker in sight is not taken for another
+LOST = 2.0  # spacings: where its place was known worse than this, nobody knows how a marker that is back moves
 FEW_SHAPES = 6  # remembered, by which nothing is told
 FRESH = 3  # frames out of sight, over which a marker's own motion still tells where it is
 STRAYING = 1.5  # so many times as uncertain as where a marker is believed is where it will be next
@@ -245,7 +246,8 @@ class Tracker:
         if seen.all() and not back.any():
             self.doubt = np.zeros(len(seen))
         else:
-            doubt = np.where(back & ~agreed, np.minimum(self.doubt, self.pattern.spacing), 0.0)
+            unsure = back & ~(agreed & (self.doubt < LOST * self.pattern.spacing))
+            doubt = np.where(unsure, np.minimum(self.doubt, self.pattern.spacing), 0.0)
             place, sigma = self._carried(place, seen, guess)
             self.doubt = np.where(seen, doubt, sigma)
         self.marks.look(place, seen, self.pattern)
