@@ -17,6 +17,7 @@ from tracking.minimise import QUALITY
 Array = NDArray[Any]
 
 RADII = (3.0, 32.0)  # of the dots looked for [px]
+SCALES = 4.0, 8.0, 16.0, 27.0  # px: radii about which they are looked for
 FLATTEST = 0.4  # least ratio of the axes
 ROUNDEST = 0.75  # least share of the outline's ellipse that is filled
 VAGUEST = 0.2  # share of a radius: as much as a fit's own uncertainty of it may excuse
@@ -190,71 +191,79 @@ def candidates(image: NDArray, dark: bool) -> Array:
     """
     found: list[Array] = []
     image = eight_bits(image)
-    signed = 255 - image if dark else image
-    for radius in (4.0, 8.0, 16.0, 27.0):
+    signed = cv2.bitwise_not(image) if dark else image
+    mean, labels = np.empty_like(image), np.empty(image.shape, np.int32)  # fresh memory takes longer than the sums
+    for radius in SCALES:
         side = int(6 * radius) | 1
-        mean = cv2.boxFilter(signed, -1, (side, side), borderType=cv2.BORDER_REFLECT)
-        mask = (signed > cv2.add(mean, LEAST_CONTRAST)).astype(np.uint8)
-        found += _blobs(image, mask, radius)
+        cv2.boxFilter(signed, -1, (side, side), dst=mean, borderType=cv2.BORDER_REFLECT)
+        mask = cv2.subtract(signed, mean, dst=mean)
+        cv2.threshold(mask, LEAST_CONTRAST, 1, cv2.THRESH_BINARY, dst=mask)
+        found += _blobs(image, cv2.connectedComponents(mask, labels, connectivity=4)[0], labels, radius)
     found.sort(key=lambda start: -abs(start[8]))
-    kept: list[Array] = []
-    for start in found:
-        size = 1.0 / np.sqrt(start[2] * start[4] - start[3] ** 2)
-        if all(np.hypot(*(start[:2] - other[:2])) > 0.8 * size for other in kept):
-            kept.append(start)
-    return np.array(kept).reshape(-1, PARAMETERS)
+    starts = np.array(found).reshape(-1, PARAMETERS)
+    size = 1.0 / np.sqrt(starts[:, 2] * starts[:, 4] - starts[:, 3] ** 2)
+    kept: list[int] = []
+    for row, place in enumerate(starts[:, :2]):
+        if np.hypot(*(place - starts[kept, :2]).T).min(initial=np.inf) > 0.8 * size[row]:
+            kept.append(row)
+    return starts[kept]
 
 
-def _blobs(image: NDArray[np.uint8], mask: NDArray[np.uint8], scale: float) -> list[Array]:
-    count, labels = cv2.connectedComponents(mask, connectivity=4)
-    box, area, centroids = _extents(labels, count)
+def _blobs(image: NDArray[np.uint8], count: int, labels: NDArray[np.int32], scale: float) -> list[Array]:
+    """Start parameters (12) of those of so many labelled blobs that could be dots of about that radius [px]."""
+    box, area, centroids, spreads = _extents(labels, count)
     low, high = max(RADII[0], 0.6 * scale) - 1.0, min(RADII[1], 1.7 * scale) + 1.0
     width, height = (box[:, 2:] - box[:, :2]).T
     chosen = (area > np.pi * low**2 * FLATTEST) & (area < np.pi * high**2)
     chosen &= (np.maximum(width, height) < 2.3 * high) & (np.minimum(width, height) > 2 * low * FLATTEST)
     chosen &= area > 0.55 * width * height
+    likely = np.flatnonzero(chosen)
+    values, vectors = np.linalg.eigh(spreads[likely] + np.eye(2) / 12)
+    filled = area[likely] / (4.0 * np.pi * np.sqrt(values.prod(axis=1)))  # 1 for an ellipse
+    round_ = (filled >= ROUNDEST) & (values[:, 0] >= FLATTEST**2 * values[:, 1])
+    outlines = vectors / (2.0 * np.sqrt(values))[:, None] @ vectors.swapaxes(1, 2)
     starts = []
-    for label in np.flatnonzero(chosen):
+    for label, outline in zip(likely[round_], outlines[round_], strict=True):
         x, y, right, bottom = box[label]
-        own = labels[y:bottom, x:right] == label
-        rows, columns = np.nonzero(own)
-        cx, cy = centroids[label]
-        dx, dy = columns + x - cx, rows + y - cy
-        covariance = np.array([[dx @ dx, dx @ dy], [dx @ dy, dy @ dy]]) / len(rows) + np.eye(2) / 12
-        values, vectors = np.linalg.eigh(covariance)
-        filled = len(rows) / (4.0 * np.pi * np.sqrt(values.prod()))  # 1 for an ellipse
-        if filled < ROUNDEST or values[0] < FLATTEST**2 * values[1]:
-            continue
-        outline = vectors @ np.diag(0.5 / np.sqrt(values)) @ vectors.T
         pad = 3
         around = image[max(y - pad, 0) : bottom + pad, max(x - pad, 0) : right + pad]
-        inside = float(np.median(image[y:bottom, x:right][own]))
+        inside = float(np.median(image[y:bottom, x:right][labels[y:bottom, x:right] == label]))
         edge = np.concatenate([around[0], around[-1], around[:, 0], around[:, -1]])
         level = float(np.median(edge))
-        starts.append(start_of(cx, cy, outline[[0, 0, 1], [0, 1, 1]], inside - level, level))
+        middle_x, middle_y = centroids[label]
+        starts.append(start_of(middle_x, middle_y, outline[[0, 0, 1], [0, 1, 1]], inside - level, level))
     return starts
 
 
 @njit(cache=True, nogil=True)
 def _extents(labels, count):  # type: ignore[no-untyped-def]
-    """Left, top and first pixel beyond right and bottom (L, 4), area (L) and centroid (L, 2) of what is labelled.
+    """What labelled blobs cover.
 
-    OpenCV's own take seven times as long. Label 0, the ground, is left out.
+    Left, top and first pixel beyond right and bottom (L, 4), area (L), centroid (L, 2) and covariance of its pixels'
+    places (L, 2, 2). OpenCV's own take seven times as long. Label 0, the ground, is left out.
     """
     height, width = labels.shape
     box, area = np.zeros((count, 4), np.int64), np.zeros(count, np.int64)
     box[:, 0], box[:, 1] = width, height
-    centroid = np.zeros((count, 2))
+    sums = np.zeros((count, 5))
     for y in range(height):
         for x in range(width):
             label = labels[y, x]
             if label:
                 area[label] += 1
-                centroid[label, 0] += x
-                centroid[label, 1] += y
+                sums[label, 0] += x
+                sums[label, 1] += y
+                sums[label, 2] += x * x
+                sums[label, 3] += x * y
+                sums[label, 4] += y * y
                 box[label, 0], box[label, 2] = min(box[label, 0], x), max(box[label, 2], x + 1)
                 box[label, 1], box[label, 3] = min(box[label, 1], y), y + 1
-    return box, area, centroid / np.maximum(area, 1).reshape(-1, 1)
+    mean = sums / np.maximum(area, 1).reshape(-1, 1)
+    spread = np.empty((count, 2, 2))
+    spread[:, 0, 0] = mean[:, 2] - mean[:, 0] ** 2
+    spread[:, 0, 1] = spread[:, 1, 0] = mean[:, 3] - mean[:, 0] * mean[:, 1]
+    spread[:, 1, 1] = mean[:, 4] - mean[:, 1] ** 2
+    return box, area, mean[:, :2].copy(), spread
 
 
 def dots_at(image: NDArray, start: Array, dark: bool) -> Dots:
