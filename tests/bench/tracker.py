@@ -51,6 +51,8 @@ def main() -> None:
     parser.add_argument("--real", type=Path, help="folder of real C3D recordings to film again")
     parser.add_argument("--out", type=Path, default=Path("build/bench-tracking.csv"))
     options = parser.parse_args()
+    if unknown := set(options.only.split(",")) - set(SECTIONS):
+        parser.error(f"expected --only of {', '.join(SECTIONS)}, found {', '.join(sorted(unknown))}")
     cv2.setNumThreads(1)  # as the command does
     threadpool_limits(1, user_api="blas")
     sys.setswitchinterval(SOON)
