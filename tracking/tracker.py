@@ -32,6 +32,7 @@ SEED_REACH = 2.2  # spacings: how far from where it is expected a marker may be
 ENOUGH = 0.7  # of the markers, of which the pattern alone tells which they are
 ANCHORED = 0.5  # spacings: surprise up to which a marker in sight is not taken for another
 LOST = 2.0  # spacings: where its place was known worse than this, nobody knows how a marker that is back moves
+UNTOLD = 0.5  # of 1: how sure it is that markers are near where they were, where nobody knows yet how they move
 FEW_SHAPES = 6  # remembered, by which nothing is told
 FRESH = 3  # frames out of sight, over which a marker's own motion still tells where it is
 STRAYING = 1.5  # so many times as uncertain as where a marker is believed is where it will be next
@@ -184,7 +185,7 @@ class Tracker:
         speed = np.linalg.norm(expected - self.motion.last, axis=1) / self.pattern.spacing
         trusted = -speed - 0.2 * np.minimum(self.missing, 10)
         surprise = float(self.motion.surprise.min())
-        sureness = 0.0 if hidden else 1.0 / (1.0 + (2.0 * surprise) ** 2) if np.isfinite(surprise) else 0.3
+        sureness = 0.0 if hidden else 1.0 / (1.0 + (2.0 * surprise) ** 2) if np.isfinite(surprise) else UNTOLD
         steady = np.zeros(len(expected))
         if (self.missing > 0).any() and surprise < CALM:  # who is out of sight could take the place of who is in sight
             steady[self.missing == 0] = 1.0 - surprise / CALM
