@@ -69,12 +69,15 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
         stream = container.streams.video[0]
         outcomes = stack.enter_context(closing(_outcomes(path, container, stream, notes)))
         extradata = stream.codec_context.extradata
-        renewals = Renewals(Units.of("h264", extradata)) if stream.codec_context.codec.name == "h264" else None
+        units = Units.of("h264", extradata) if stream.codec_context.codec.name == "h264" else None
+        renewals, told = None if units is None else Renewals(units), False
         for packet, frames, damaged in outcomes:
             stamp = packet.pts if packet.size else None
+            if units is not None and packet.is_keyframe:
+                told = units.parts(bytes(packet)) == 1  # a part that is lost is not told of
             since = (0 if packet.is_keyframe else None) if renewals is None else renewals.since(packet)
             unstamped = packet.size > 0 and stamp is None
-            yield Piece(stamp, since is not None, float(packet.time_base), frames, damaged, since or 0, unstamped)
+            yield Piece(stamp, since is not None, float(packet.time_base), frames, damaged, since or 0, unstamped, told)
 
 
 def _outcomes(

@@ -23,6 +23,8 @@ logging.getLogger("libav").addHandler(logging.NullHandler())
 logging.getLogger("libav").propagate = False
 # What makes FFmpeg's decoders report damage instead of painting over it, and export how coarsely a picture was coded.
 STRICT = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data": "venc_params"}
+# What the decoder of H.264 says at once of a picture that lacks parts, which it marks as damaged only when it shows it.
+PAINTED_OVER = "concealing"
 # What H.264 and HEVC never write where a file tells how long their units are, and what lost sectors look like; their
 # decoders may read on in silence.
 NEVER, WRITERS = bytes(4), {"h264", "hevc"}
@@ -76,7 +78,7 @@ class FFmpegDecoder:
                 frames = self.context.decode(packet)
             except av.FFmpegError:
                 return [], True
-        complaints = any(level <= av.logging.ERROR for level, _, _ in messages)
+        complaints = any(level <= av.logging.ERROR or text.startswith(PAINTED_OVER) for level, _, text in messages)
         return frames, complaints or packet.is_corrupt
 
 
@@ -100,6 +102,9 @@ def packets_of(
             packet = next(packets)
         except StopIteration:
             return
+        except IndexError:  # PyAV's, of a stream that begins amid the file, as damage in .ts makes one seem to
+            packets = container.demux(stream)
+            continue
         except (av.FFmpegError, OSError) as error:
             notes.append(f"{container.name}: the file breaks off or is damaged ({error})")
             return

@@ -45,6 +45,7 @@ class Piece:
         complained: whether the decoder found damage.
         since: how many packets before a key frame's it needs, where pictures are renewed bit by bit.
         unstamped: holds a frame without a stamp.
+        told: whether the decoder tells of all damage with the packet, not only with the frame.
     """
 
     stamp: int | None
@@ -54,6 +55,7 @@ class Piece:
     complained: bool
     since: int = 0
     unstamped: bool = False
+    told: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ class Order:
     Every packet has a slot by its time stamp. A frame that comes out of the decoder fills its own; slots before it
     that are still empty were lost, and what comes for them later is dropped. A damaged frame spoils those decoded after
     it that may refer to it. Some decoders own up to damage only when the frame comes out, and frames that refer to
-    it may be shown before it: none is given on before all that were decoded before it are out.
+    it may be shown before it: of theirs none is given on before all that were decoded before it are out.
     """
 
     packets: dict[int, _Packet] = field(default_factory=dict)
@@ -106,7 +108,7 @@ class Order:
             if piece.complained:
                 self._spoil(piece.stamp)
             while piece.frames:
-                yield from self._shown(piece.frames.pop(0))
+                yield from self._shown(piece.frames.pop(0), piece.told)
             if not self.damaged:
                 self.depth = max(self.depth, self.unstamped)
             yield from self._overdue(self.depth)
@@ -137,7 +139,7 @@ class Order:
         if number not in self.damaged[-1:]:
             insort(self.damaged, number)
 
-    def _shown(self, frame: Decoded) -> Iterator[Frame]:
+    def _shown(self, frame: Decoded, told: bool) -> Iterator[Frame]:
         """The frames that can be given on once this one is out."""
         if self.shape is None and frame.picture is not None:
             self.shape = frame.picture.shape
@@ -145,7 +147,7 @@ class Order:
             self._spoil(frame.stamp)
         if frame.stamp not in self.gone:
             self.held.append(frame)
-        while self.held and (len(self.held) > DEEPEST or self._is_ready(self.held[0], frame.stamp)):
+        while self.held and (told or len(self.held) > DEEPEST or self._is_ready(self.held[0], frame.stamp)):
             yield from self._given_on(self.held.popleft())
 
     def _is_ready(self, frame: Decoded, out: int | None) -> bool:

@@ -42,6 +42,10 @@ class Units:
             start = end
         return units
 
+    def parts(self, content: bytes) -> int:
+        """How many parts of pictures a packet of H.264 holds."""
+        return sum(0 < unit[0] & KIND <= WHOLE for unit in self.split(content))
+
     def joined(self, units: list[bytes]) -> bytes:
         """A packet of units."""
         return b"".join((len(unit).to_bytes(self.length, "big") if self.length else MARK) + unit for unit in units)

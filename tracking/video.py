@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from groundwork import InputError
 from tracking.ahead import ahead
 from tracking.decoding import frames_of_file
-from tracking.ffmpeg import opened
+from tracking.ffmpeg import opened, packets_of
 from tracking.frame import Frame, quarter_turns, scaled
 from tracking.jpeg import PROBED, is_whole
 
@@ -118,7 +118,7 @@ def open_video(path: Path) -> Video:
 
 def _quarter_turns(container: "av.container.InputContainer", stream: "av.video.stream.VideoStream") -> int:
     """How many quarter turns anticlockwise the first frame asks to be shown by."""
-    for packet in container.demux(stream):
+    for packet in packets_of(container, stream, []):
         try:
             frames = packet.decode()
         except av.FFmpegError:

@@ -1,5 +1,6 @@
 """What damage to a video file leaves of it: frames that are right, and frames that are missing."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import av
@@ -9,6 +10,7 @@ import pytest
 from support import FRAMES, ramp, write_video
 
 from groundwork import InputError
+from tracking.ffmpeg import FFmpegDecoder, packets_of
 from tracking.video import open_video
 
 SAFE = {"libx264": {"g": "6"}, "ffv1": {"level": "3", "slicecrc": "1", "g": "6"}}  # short groups, checksums
@@ -145,7 +147,7 @@ def lost_and_wrong(path: Path, packet: int, start: int, content: bytes) -> tuple
 
 
 def test_frames_that_refer_to_a_damaged_one_are_missing_though_shown_before_it(tmp_path: Path) -> None:
-    """H.264 with B-frames, a packet's beginning overwritten: the decoder owns up when its frame is out."""
+    """H.264 with B-frames, a packet's beginning overwritten."""
     path = tmp_path / "a.mp4"
     random = np.random.default_rng(3)
     options = {"crf": "20", "bf": "3", "g": "10"}
@@ -192,6 +194,49 @@ def test_intact_hevc_is_found_intact_time_and_again(tmp_path: Path) -> None:
     write_video(path, "libx265", "yuv420p", options={"x265-params": "log-level=none:bframes=0:qp=24"})
     for _ in range(30):
         assert all(frame.picture is not None for frame in open_video(path).read())
+
+
+def test_h264_tells_of_damage_with_the_packet(tmp_path: Path) -> None:
+    """So that frames shown before a damaged one, which refer to it, need not wait for it to come out.
+
+    A bit of a picture is turned over, which often only leaves a part of it undecoded.
+    """
+    path, damaged = tmp_path / "a.mp4", tmp_path / "damaged.mp4"
+    random = np.random.default_rng(9)
+    write_video(path, "libx264", "yuv420p", options={"crf": "20", "bf": "3"}, pictures=moving_texture(random))
+    with av.open(str(path)) as container:
+        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
+    marked: list[int | None] = []
+    for _ in range(60):
+        content, victim = bytearray(path.read_bytes()), packets[random.integers(len(packets))]
+        content[content.find(victim) + random.integers(40, len(victim))] ^= 1 << random.integers(8)
+        damaged.write_bytes(content)
+        with av.open(str(damaged)) as container:
+            decoder = FFmpegDecoder(container.streams.video[0])
+            told = set()
+            for packet in container.demux(video=0):
+                frames, complained = decoder.decoded(packet)
+                told |= {packet.pts} if complained else set()
+                marked += [frame.pts for frame in frames if frame.is_corrupt]
+                assert all(frame.pts in told for frame in frames if frame.is_corrupt)
+    assert len(marked) > 5
+
+
+def test_another_stream_that_seems_to_begin_amid_a_file_is_passed_over() -> None:
+    """As damage makes it seem in an MPEG transport stream; PyAV does not know its number."""
+
+    class Container:
+        left = iter([1, 2, IndexError(), 3, IndexError()])
+
+        def demux(self, _: object) -> Iterator[object]:
+            for item in self.left:
+                if isinstance(item, IndexError):
+                    raise item
+                yield item
+
+    notes: list[str] = []
+    assert list(packets_of(Container(), None, notes)) == [1, 2, 3]  # type: ignore[arg-type]
+    assert not notes
 
 
 @pytest.mark.parametrize("others", ["bframes=0", "bframes=2"])
