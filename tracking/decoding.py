@@ -70,11 +70,11 @@ def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
         outcomes = stack.enter_context(closing(_outcomes(path, container, stream, notes)))
         extradata = stream.codec_context.extradata
         units = Units.of("h264", extradata) if stream.codec_context.codec.name == "h264" else None
-        renewals, told = None if units is None else Renewals(units), False
+        renewals, told = None if units is None else Renewals(units), units is not None
         for packet, frames, damaged in outcomes:
             stamp = packet.pts if packet.size else None
-            if units is not None and packet.is_keyframe:
-                told = units.parts(bytes(packet)) == 1  # a part that is lost is not told of
+            if units is not None and packet.size:
+                told = told and units.parts(bytes(packet)) == 1  # where there are several, one may be lost in silence
             since = (0 if packet.is_keyframe else None) if renewals is None else renewals.since(packet)
             unstamped = packet.size > 0 and stamp is None
             yield Piece(stamp, since is not None, float(packet.time_base), frames, damaged, since or 0, unstamped, told)
