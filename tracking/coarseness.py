@@ -4,12 +4,14 @@ All in steps of H.264 that do a dot as much harm, for which `tracking.noise` was
 """
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import ClassVar
 
 import av
 import numpy as np
 from av.sidedata.sidedata import Type as SideData
+from av.video.frame import PictureType
 from numpy.typing import NDArray
 
 from tracking.frame import MACROBLOCK, quarter_turns
@@ -23,11 +25,16 @@ VP9, H264, MPEG = 0, 1, 2
 # A step of theirs does the harm of so many of H.264's times a power of it. Measured on 14 to 20 films each, most like
 # those for H.264: x265 at crf 16 to 28, SVT-AV1 at 18 to 42, libvpx at 20 to 42, FFmpeg's MPEG-4 at 2 to 8.
 HARM = {"hevc": (0.13, 1.48), "av1": (4.0, 0.4), "vp9": (0.64, 0.85), "mpeg4": (1.35, 1.08)}
-# What x264 and x265 say of themselves, and how much coarser their pictures are than their steps alone would make them
-# where they searched no more thoroughly than that (their `subme`). Measured on seven and four presets at crf 23: in a
-# hurry they let everything lag.
+# What x264 and x265 say of themselves, and where they searched no more thoroughly than that (their `subme`), how much
+# coarser their pictures are than their steps alone would make them: everywhere, and where nothing moves fast, in most
+# frames and in those made of frames before and after (B). In a hurry they let things lag. Measured on seven and four
+# presets at crf 23, of four of x264's also at 18 and 28, on 42 films.
 SEARCHED = re.compile(rb"x26([45]) [(-].{,1500}? subme=(\d{1,2}) ", re.DOTALL)
-COARSER = {b"4": ((2, 2.4), (6, 1.4)), b"5": ((0, 2.3), (1, 1.4))}
+PATIENT = 1.0, 1.0, 1.0
+HASTY = {
+    b"4": {0: (2.4, 1.0, 1.0), 2: (1.0, 1.8, 3.9), 6: (1.2, 1.0, 1.4)},
+    b"5": {0: (2.3, 1.0, 1.0), 1: (1.4, 1.0, 1.0)},
+}
 # Frames of which one is asked how it was coded, and fewer once so many have passed; kinds of frames come in fours and
 # twelves. Each answer takes as long as a third of a frame; a dozen are too few to tell the usual step of a short film.
 ASKED, LATER, MANY = 5, 113, 100
@@ -41,19 +48,25 @@ class ByDecoder:
     Attributes:
         costly: the frames that are asked hold on to their memory.
         coarser: how much coarser a video is coded than by its steps alone; 0 where that is not known yet.
+        lags: how much coarser yet where nothing moves fast, in most frames and in those of kind B.
     """
 
     costly: ClassVar[bool] = True
     coarser: float = 0.0
+    lags: Sequence[float] = (1.0, 1.0)
 
     def look(self, packet: "av.packet.Packet") -> None:
         """At the next packet, before its frames."""
         if not self.coarser:
-            self.coarser = _coarser(bytes(packet))
+            self.coarser, *self.lags = _haste(bytes(packet))
 
     def tells_of(self, number: int) -> bool:
         """Whether to ask for a frame's steps."""
         return number % (ASKED if number < MANY else LATER) == 0
+
+    def lag(self, frame: "av.VideoFrame") -> float:
+        """How much coarser a frame is yet where nothing moves fast."""
+        return self.lags[frame.pict_type == PictureType.B]
 
     def steps(self, frame: "av.VideoFrame") -> NDArray | None:
         """Of a frame of 8 bits, (1, 1) or as it is to be shown in squares of 16 px."""
@@ -118,7 +131,7 @@ class ByHeaders:
         """At the next packet, before its frames."""
         content = bytes(packet)
         if not self.coarser:
-            self.coarser = _coarser(self.parameters + content)
+            self.coarser = _haste(self.parameters + content)[0]
         with av.logging.Capture(local=True) as said:
             try:
                 self.speller.filter(av.Packet(content))
@@ -129,6 +142,10 @@ class ByHeaders:
     def tells_of(self, _: int) -> bool:
         """Whether to ask for a frame's steps."""
         return bool(np.isfinite(self.step))
+
+    def lag(self, _: "av.VideoFrame") -> float:
+        """See `ByDecoder`; not known of these codecs."""
+        return 1.0
 
     def steps(self, frame: "av.VideoFrame") -> NDArray:
         """Of a frame of the last packet, (1, 1)."""
@@ -152,10 +169,12 @@ class ByHeaders:
             self.step = float(np.sqrt(np.mean(np.square(steps))))
 
 
-def _coarser(said: bytes) -> float:
-    """How much coarser than by its steps alone a video is coded, by what its encoder said."""
+def _haste(said: bytes) -> tuple[float, float, float]:
+    """How much coarser a video is than by its steps alone, as `HASTY` has it, by what its encoder said."""
     found = SEARCHED.search(said)
-    return 1.0 if found is None else next((times for most, times in COARSER[found[1]] if int(found[2]) <= most), 1.0)
+    if found is None:
+        return PATIENT
+    return next((times for most, times in HASTY[found[1]].items() if int(found[2]) <= most), PATIENT)
 
 
 def _harm(codec: str, steps: NDArray) -> NDArray:

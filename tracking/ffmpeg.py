@@ -65,7 +65,8 @@ class FFmpegDecoder:
             told = self.coarseness if self.coarseness is not None and self.coarseness.tells_of(self.number) else None
             costly = told is not None and told.costly
             # A decoder that needs no earlier pictures works the quicker the sooner it has its memory back.
-            taken.append(_taken(frames.pop(0), self.copies or costly, told))
+            lag = 1.0 if self.coarseness is None else self.coarseness.lag(frames[0])
+            taken.append(_taken(frames.pop(0), self.copies or costly, told, lag))
             self.number += 1
             if costly:
                 gc.collect(0)  # a frame and its side data hold on to each other, and to the decoder's memory
@@ -111,10 +112,10 @@ def packets_of(
         yield packet
 
 
-def _taken(frame: "av.VideoFrame", copy: bool, told: Coarseness | None) -> Decoded:
+def _taken(frame: "av.VideoFrame", copy: bool, told: Coarseness | None, lag: float) -> Decoded:
     """What is needed of a frame; its steps only where something tells of them."""
     picture = None if frame.is_corrupt else grey(frame, copy)
-    return Decoded(frame.pts, picture, None if told is None or picture is None else told.steps(frame))
+    return Decoded(frame.pts, picture, None if told is None or picture is None else told.steps(frame), lag)
 
 
 def grey(frame: "av.VideoFrame", copy: bool) -> NDArray:

@@ -72,7 +72,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     for frame in reading:
         times.append(frame.time)
         damaged.append(frame.picture is None)
-        sight = Sight(NOTHING, NOTHING, NOTHING, NOTHING[:, 0])
+        sight = Sight(NOTHING, NOTHING, NOTHING, NOTHING[:, 0], frame.lag)
         if frame.picture is not None and tracker is None:
             found = find_family(frame.picture)
             most = max(most, 0 if found is None else len(found[1]))
@@ -113,22 +113,27 @@ class Sight:
         sigma: from the fits [px], (D, 2), NaN where not seen.
         leverage: what a grey level of independent noise in every pixel moves the centre by [px], (D, 2).
         step: by which the video's coding rounded the picture there [grey levels], (D), NaN where not known.
+        lag: see `Frame`.
     """
 
     pixel: Array
     sigma: Array
     leverage: Array
     step: Array
+    lag: float
 
     @classmethod
     def of(cls, dots: Dots, frame: Frame) -> "Sight":
         """Those of a frame; dots without a sigma are not seen."""
         pixel = np.where(np.isfinite(dots.sigma), dots.centre, np.nan)
-        return cls(pixel, dots.sigma, dots.leverage, frame.step_at(pixel))
+        return cls(pixel, dots.sigma, dots.leverage, frame.step_at(pixel), frame.lag)
 
 
-def _whole(seen: list[Sight], late: list[Newcomer], count: int) -> tuple[Array, Array, Array, Array]:
-    """Pixels, sigma, leverage (T, D, 2) and steps (T, D) of all markers, NaN where not seen; the last come late."""
+def _whole(seen: list[Sight], late: list[Newcomer], count: int) -> tuple[Array, Array, Array, Array, Array]:
+    """Pixels, sigma, leverage (T, D, 2) and steps (T, D) of all markers, NaN where not seen, and what `lag` is (T).
+
+    The last markers come late.
+    """
     paths, fitted, leverage = np.full((3, len(seen), count, 2), np.nan)
     step = np.full((len(seen), count), np.nan)
     for frame, sight in enumerate(seen):
@@ -138,7 +143,7 @@ def _whole(seen: list[Sight], late: list[Newcomer], count: int) -> tuple[Array, 
     for column, newcomer in enumerate(late, start=count - len(late)):
         for frame, (pixel, sigma) in newcomer.seen.items():
             paths[frame, column], fitted[frame, column] = pixel, sigma
-    return paths, fitted, leverage, step
+    return paths, fitted, leverage, step, np.array([sight.lag for sight in seen])
 
 
 class _Album:

@@ -22,11 +22,13 @@ class Decoded:
         stamp: when it is shown, in the stream's own unit; None where it does not say.
         picture: grey levels, see `Frame`; None where damaged.
         steps: by which it was rounded, see `Frame`.
+        lag: see `Frame`.
     """
 
     stamp: int | None
     picture: NDArray | None
     steps: NDArray | None
+    lag: float = 1.0
 
     def size(self) -> int:
         """Of the picture [bytes]."""
@@ -157,12 +159,11 @@ class Order:
     def _given_on(self, frame: Decoded) -> Iterator[Frame]:
         if frame.stamp is None:
             self.unstamped -= 1
-            sound = self._is_sound(None)
-            yield Frame(np.nan, frame.picture if sound else None, frame.steps if sound else None)
+            yield _shown_at(np.nan, frame, self._is_sound(None))
             return
         yield from self._lost(frame.stamp)
         sound = self._is_sound(self.packets.pop(frame.stamp, None))
-        yield Frame(self._time(frame.stamp), frame.picture if sound else None, frame.steps if sound else None)
+        yield _shown_at(self._time(frame.stamp), frame, sound)
 
     def _is_sound(self, packet: _Packet | None) -> bool:
         if packet is None:  # it may be one that was decoded before the last key frame
@@ -190,3 +191,8 @@ class Order:
         if self.start is None:
             self.start = stamp
         return (stamp - self.start) * self.base
+
+
+def _shown_at(time: float, frame: Decoded, sound: bool) -> Frame:
+    """A frame in its place, which shows nothing unless it is sound."""
+    return Frame(time, frame.picture, frame.steps, frame.lag) if sound else Frame(time, None)

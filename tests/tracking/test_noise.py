@@ -29,7 +29,7 @@ def coded(pixel: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
     step = 16.0
     leverage = np.full(pixel.shape, (error / LAGGING) ** (1.0 / POWER) / step)
     fitted = np.where(np.isnan(pixel), np.nan, 0.3 * step * leverage)  # noise of a third of the step
-    return places_and_errors(pixel, fitted, leverage, np.full(pixel.shape[:2], step))
+    return places_and_errors(pixel, fitted, leverage, np.full(pixel.shape[:2], step), np.ones(len(pixel)))
 
 
 def test_honest_fits_are_left_alone(random: np.random.Generator) -> None:
@@ -76,6 +76,31 @@ def test_markers_that_turn_round_wait_together(random: np.random.Generator) -> N
     assert np.median(sigma[np.abs(speed) > 0.5]) < 0.8 * np.median(sigma[turning])
 
 
+@pytest.mark.parametrize("swing", [1.0, 2000.0])
+def test_slow_motion_lags_in_haste(random: np.random.Generator, swing: float) -> None:
+    """Three of four frames show slow markers half way to where those before and after have them, fast ones right."""
+    time = np.arange(201)
+    truth = np.zeros((201, 20, 2))
+    truth[..., 1] = swing * np.linspace(0.5, 1.0, 20) * np.sin(0.45 * time)[:, None]
+    pixel = truth + random.normal(size=truth.shape) * 0.05
+    between = time % 4 > 0
+    if swing < 100.0:
+        for k in range(20):
+            straight = np.interp(time, time[~between], truth[~between, k, 1])
+            pixel[between, k, 1] += 0.5 * (straight - truth[:, k, 1])[between]
+    step, fitted = 15.0, 0.03
+    leverage = np.full(pixel.shape, (0.05 / LAGGING) ** (1.0 / POWER) / step)
+    place, sigma = places_and_errors(
+        pixel, np.full(pixel.shape, fitted), leverage, np.full((201, 20), step), np.where(between, 4.0, 1.5)
+    )
+    usual = np.sqrt((sigma[..., 1] ** 2).mean(axis=1))
+    if swing < 100.0:
+        assert np.median(usual[between]) > 1.5 * np.median(usual[~between])
+        assert np.mean(np.abs(place - truth) > 3.0 * sigma) < 0.01
+    else:
+        assert np.median(usual[between]) == pytest.approx(np.median(usual[~between]), rel=0.2)
+
+
 def test_a_marker_that_moves_on_its_own_stays_where_it_was_seen(random: np.random.Generator) -> None:
     """One that trembles all the time, by ten times the error expected, and one that is jerked once: or so it seems."""
     pixel = paths(random, np.full(20, 0.05))
@@ -91,7 +116,9 @@ def test_places_stay_where_nothing_is_known_of_the_coding(random: np.random.Gene
     pixel = paths(random, np.full(20, 0.05))
     pixel[50:60, 4] = np.nan
     sigma = np.where(np.isnan(pixel), np.nan, 0.05)
-    place, _ = places_and_errors(pixel, sigma, np.full(pixel.shape, 0.01), np.full(pixel.shape[:2], np.nan))
+    place, _ = places_and_errors(
+        pixel, sigma, np.full(pixel.shape, 0.01), np.full(pixel.shape[:2], np.nan), np.ones(200)
+    )
     np.testing.assert_array_equal(place, pixel)
 
 
@@ -101,7 +128,7 @@ def test_a_place_far_off_says_so_and_no_other_does(random: np.random.Generator) 
     pixel[77, 8, 1] += 16.0
     sigma = np.full(pixel.shape, 0.05)
     unknown = np.full(pixel.shape, np.nan)
-    place, found = places_and_errors(pixel, sigma, unknown, unknown[..., 0])
+    place, found = places_and_errors(pixel, sigma, unknown, unknown[..., 0], np.ones(200))
     np.testing.assert_array_equal(place, pixel)
     assert found[77, 8, 1] > 4.0
     found[77, 8, 1] = np.nan

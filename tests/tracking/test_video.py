@@ -234,13 +234,23 @@ def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
     write_video(path, "libx264", "yuv420p", options={"qp": "30", "bf": "0"})
     later = list(open_video(path).read())[5]
     np.testing.assert_allclose(later.steps, 20.0)
-    for preset, coarser in (("ultrafast", 2.4), ("veryfast", 2.4), ("faster", 1.4), ("medium", 1.0), ("slow", 1.0)):
+    for preset, coarser in (("ultrafast", 2.4), ("veryfast", 1.0), ("faster", 1.2), ("medium", 1.0), ("slow", 1.0)):
         write_video(path, "libx264", "yuv420p", options={"qp": "30", "bf": "0", "preset": preset})
         np.testing.assert_allclose(list(open_video(path).read())[5].steps, coarser * 20.0)
     write_video(path.with_suffix(".avi"), "mjpeg", "yuvj420p")
     frame = next(iter(open_video(path.with_suffix(".avi")).read()))
     assert frame.steps is None
     assert np.isnan(frame.step_at(corners)).all()
+
+
+def test_haste_makes_frames_lag_most_between_others(tmp_path: Path) -> None:
+    """Every frame of twelve but 0, 4, 8 and the last is made of those before and after."""
+    path = tmp_path / "a.mp4"
+    for preset, most, between in (("veryfast", 1.8, 3.9), ("faster", 1.0, 1.4), ("medium", 1.0, 1.0)):
+        options = {"qp": "30", "bf": "3", "b-adapt": "0", "b-pyramid": "none", "preset": preset}
+        write_video(path, "libx264", "yuv420p", options=options)
+        expected = [between if number % 4 and number < 11 else most for number in range(12)]
+        assert [frame.lag for frame in open_video(path).read()] == expected
 
 
 @pytest.mark.parametrize(("ending", "bits"), [("mp4", ""), ("ts", ""), ("mkv", "10le")])
