@@ -23,10 +23,11 @@ STILL, LAGGING, POWER = 1.69, 0.346, 0.664
 # less than SLOW of these errors: where markers turn round, they wait together until the encoder takes notice. Measured
 # likewise.
 SHARED, WAITING, SLOW = 0.009, 3.0, 5.0
-# So many of the errors of an encoder in a hurry a marker moves from frame to frame where haste does half its harm; and
-# the share of markers seen to move from which on those that are not may move as well, too little for it to take notice.
+# The share of markers that move by more than these errors from which on others may move too, unseen by the encoder.
+FEW = 0.2
+# So many of the errors of an encoder in a hurry a marker moves from frame to frame where haste does half its harm.
 # Measured on 42 films of presets from superfast to fast.
-FAST, FEW = 13.0, 0.2
+FAST = 13.0
 # So many times the variance of these errors may still be error, not the body's own motion; and so many times the errors
 # themselves may, together, pass for a mode of it.
 EXCESS, PASSING = 2.0, 2.0
@@ -108,10 +109,10 @@ def coding_errors(pixel: Array, fitted: Array, leverage: Array, step: Array, has
     count = np.maximum(np.isfinite(pixel).sum(axis=0), 1)
     mean = np.nansum(pixel, axis=0) / count
     spread = np.nansum((pixel - mean) ** 2, axis=0) / count
+    lagging = np.maximum(LAGGING * rounded**POWER, still)
     moves = spread > 4.0 * (still**2).sum(axis=0) / count
-    if haste.max() > 1.0:
-        moves |= moves.mean(axis=0) > FEW
-    return np.where(moves, np.maximum(LAGGING * rounded**POWER, still), still)
+    moves |= (spread > (lagging**2).sum(axis=0) / count).mean(axis=0) > FEW
+    return np.where(moves, lagging, still)
 
 
 def step_over_noise(fitted: Array, leverage: Array, step: Array) -> float:

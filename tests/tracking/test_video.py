@@ -251,6 +251,9 @@ def test_haste_makes_frames_lag_most_between_others(tmp_path: Path) -> None:
         write_video(path, "libx264", "yuv420p", options=options)
         expected = [between if number % 4 and number < 11 else most for number in range(12)]
         assert [frame.lag for frame in open_video(path).read()] == expected
+    path.write_bytes(path.read_bytes().replace(b"x264 - core", b"camera core"))  # one that does not say
+    expected = [1.5 if number % 4 and number < 11 else 1.2 for number in range(12)]
+    assert [frame.lag for frame in open_video(path).read()] == expected
 
 
 @pytest.mark.parametrize(("ending", "bits"), [("mp4", ""), ("ts", ""), ("mkv", "10le")])
