@@ -101,6 +101,16 @@ def test_slow_motion_lags_in_haste(random: np.random.Generator, swing: float) ->
         assert np.median(usual[between]) == pytest.approx(np.median(usual[~between]), rel=0.2)
 
 
+def test_a_marker_that_seems_still_on_a_body_that_moves_may_move(random: np.random.Generator) -> None:
+    """It was not seen to: an encoder passes over so little. Where nobody moves, nothing speaks against it."""
+    sigmas = []
+    for swing in (0.0, 1.0):
+        pixel = swing * paths(random, np.zeros(20)) + random.normal(size=(200, 20, 2)) * 0.02
+        pixel[:, 3] = random.normal(size=(200, 2)) * 0.005
+        sigmas.append(coded(pixel, 0.1)[1][:, 3])
+    assert np.median(sigmas[1]) > 1.3 * np.median(sigmas[0])
+
+
 def test_a_marker_that_moves_on_its_own_stays_where_it_was_seen(random: np.random.Generator) -> None:
     """One that trembles all the time, by ten times the error expected, and one that is jerked once: or so it seems."""
     pixel = paths(random, np.full(20, 0.05))
