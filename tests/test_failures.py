@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable
@@ -94,7 +95,7 @@ def test_who_is_stopped_gives_up_what_runs_and_what_waits(lab: Path, monkeypatch
     def endless(_videos: object, _rig: object, _settings: object, tick: Callable[[], None]) -> None:
         begun.append(time.monotonic())
         if len(begun) == 2:
-            os.kill(os.getpid(), signal.SIGINT)
+            signal.pthread_kill(threading.get_ident(), signal.SIGINT)  # who waits is not woken by it
         while time.monotonic() < begun[0] + 60.0:
             tick()
             time.sleep(0.01)

@@ -4,7 +4,7 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from concurrent.futures import CancelledError, ThreadPoolExecutor
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -37,6 +37,7 @@ from tracking.tracks import Tracks, write_tracks
 from tracking.video import Video
 
 MODELS = ("orthographic", "pinhole")
+HEEDING = 1.0  # s after which whoever waits looks whether it was told to stop: not every signal wakes it
 SOON = 1e-4  # s after which a thread that needs the interpreter has it: while a decoder waits, nothing is decoded
 
 calibrate_app = command_line("Calibrate cameras.")
@@ -220,6 +221,8 @@ def track(
             for name, sources in recordings.items()
         }
         for name, future in waiting.items():
+            while not wait([future], HEEDING).done:
+                pass
             try:
                 done[name], was_there = future.result()
             except InputError as error:
