@@ -101,7 +101,11 @@ def test_who_is_stopped_gives_up_what_runs_and_what_waits(lab: Path, monkeypatch
             time.sleep(0.01)
 
     monkeypatch.setattr("tracking.cli.track_recording", endless)
-    result = CliRunner().invoke(track_app, command(lab))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs in a shell's background ignores it
+    try:
+        result = CliRunner().invoke(track_app, command(lab))
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert time.monotonic() < begun[0] + 30.0
     assert (result.exit_code, len(begun)) == (130, 2)
     assert not (lab / "tracks").exists()
