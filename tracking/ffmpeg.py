@@ -60,12 +60,14 @@ class FFmpegDecoder:
             self.watched = self.begun or not content.endswith(NEVER)
             complained |= self.watched and NEVER in content
         self.begun = True
-        taken = []
+        taken: list[Decoded] = []
+        ended = packet.size == 0
         while frames:
-            told = self.coarseness if self.coarseness is not None and self.coarseness.tells_of(self.number) else None
+            asked = self.coarseness is not None and self.coarseness.tells_of(self.number, ended)
+            told = self.coarseness if asked else None
             costly = told is not None and told.costly
+            lag = 1.0 if self.coarseness is None else self.coarseness.lag(frames[0], ended and len(frames) == 1)
             # A decoder that needs no earlier pictures works the quicker the sooner it has its memory back.
-            lag = 1.0 if self.coarseness is None else self.coarseness.lag(frames[0])
             taken.append(_taken(frames.pop(0), self.copies or costly, told, lag))
             self.number += 1
             if costly:

@@ -20,7 +20,8 @@ class Frame:
         steps: by which H.264 rounded the changes in each square of 16 px [grey levels], (H / 16, W / 16), or by which
             it would do a dot as much harm as the video's codec did, (1, 1) where that is said of whole pictures; larger
             where the encoder says that it was in a hurry; None in most frames, and where nothing is said.
-        lag: so many times coarser than these steps it is where nothing moves fast, if its encoder was in a hurry.
+        lag: so many times coarser than these steps it is where nothing moves fast, if its encoder was in a hurry or no
+            other frame is made of it.
     """
 
     time: float

@@ -213,15 +213,15 @@ def test_a_video_marked_as_turned_is_shown_turned(tmp_path: Path, name: str, cod
 def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
     """H.264 whose macroblocks differ; at a fixed quantiser of 30, whose step is 20 levels; Motion JPEG says none.
 
-    An encoder in a hurry counts as a coarser one.
+    An encoder in a hurry counts as a coarser one. The last frames are asked too.
     """
     path = tmp_path / "a.mp4"
     write_video(path, "libx264", "yuv420p", options={"crf": "25", "aq-mode": "1", "aq-strength": "2"})
     plain = [frame.steps for frame in open_video(path).read()]
     lay_on_its_side(path)
     turned = list(open_video(path).read())
-    assert [number for number, steps in enumerate(plain) if steps is not None] == [0, 5, 10]
-    for number in (0, 5, 10):
+    assert [number for number, steps in enumerate(plain) if steps is not None] == [0, 5, 10, 11]
+    for number in (0, 5, 10, 11):
         steps = plain[number]
         assert steps is not None
         assert steps.shape == (4, 6)
@@ -244,15 +244,16 @@ def test_steps_of_coding_turn_with_the_picture(tmp_path: Path) -> None:
 
 
 def test_haste_makes_frames_lag_most_between_others(tmp_path: Path) -> None:
-    """Every frame of twelve but 0, 4, 8 and the last is made of those before and after."""
+    """Every frame of twelve but 0, 4, 8 and the last is made of those before and after; of the last none is made."""
     path = tmp_path / "a.mp4"
-    for preset, most, between in (("veryfast", 1.8, 3.9), ("faster", 1.0, 1.4), ("medium", 1.0, 1.0)):
+    presets = ("veryfast", 1.8, 3.9, 3.9), ("faster", 1.0, 1.4, 2.0), ("medium", 1.0, 1.0, 2.0)
+    for preset, most, between, last in presets:
         options = {"qp": "30", "bf": "3", "b-adapt": "0", "b-pyramid": "none", "preset": preset}
         write_video(path, "libx264", "yuv420p", options=options)
-        expected = [between if number % 4 and number < 11 else most for number in range(12)]
+        expected = [between if number % 4 else most for number in range(11)] + [last]
         assert [frame.lag for frame in open_video(path).read()] == expected
     path.write_bytes(path.read_bytes().replace(b"x264 - core", b"camera core"))  # one that does not say
-    expected = [1.5 if number % 4 and number < 11 else 1.2 for number in range(12)]
+    expected = [1.5 if number % 4 else 1.2 for number in range(11)] + [2.0]
     assert [frame.lag for frame in open_video(path).read()] == expected
 
 
