@@ -82,6 +82,11 @@ class Dots:
         xx, xy, yy = self.parameters[:, 5:8].T
         return np.sqrt(np.maximum(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy), LEAST_BLUR))
 
+    def within(self, image: NDArray) -> NDArray[np.bool_]:
+        """Which have their centre in the picture, (D)."""
+        x, y = self.centre.T
+        return (x > 0) & (y > 0) & (x < image.shape[1] - 1) & (y < image.shape[0] - 1)
+
     def beside(self, more: "Dots") -> "Dots":
         """These and more."""
         return Dots(*(np.concatenate([getattr(self, name), getattr(more, name)]) for name in self.__dataclass_fields__))
@@ -280,8 +285,7 @@ def _are_sound(image: NDArray, dots: Dots, dark: bool) -> NDArray[np.bool_]:
     largest = dots.radius * (1.0 + 2.0 * np.minimum(dots.vague, VAGUEST))
     good &= (largest > RADII[0] - 1) & (dots.radius < RADII[1] + 1) & (dots.used > 0.5)
     good &= (np.abs(dots.contrast) > LEAST_CONTRAST) & ((dots.contrast < 0) == dark)
-    good &= (dots.centre > 0).all(axis=1) & (dots.centre < np.array(image.shape[::-1]) - 1).all(axis=1)
-    return good
+    return good & dots.within(image)
 
 
 def apart(dots: Dots, nearest: float) -> Dots:

@@ -24,6 +24,7 @@ SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
 STRANGE = 4.5  # likewise, though it stands where the family's rows go on: under a gloss a dot hardly looks like one
 AROUND, IN_LINE, LINES = 8, 0.12, 3  # nearest members, of their distance, and how many lines it then must stand in
+GLOSSY = 0.85  # of the surroundings of its neighbours: a gloss adds light, so that such a dot's are hardly darker
 DIM, DIMMEST = 0.3, 0.15  # of the usual contrast; between them a dot must keep back as large a share of the light
 BLACKEST = 1.25  # shade: a dot that seems to keep back more than all light is none
 SPOT_SHARE, SPOT_LEAST = 0.3, 0.5  # of the usual and of the dimmest marker's contrast: what a spot must stand out by
@@ -84,8 +85,8 @@ def _admitted(  # type: ignore[no-untyped-def]
 
 
 def _quality(dots: Dots) -> NDArray:
-    """How much each counts, (D): a printed dot is located ten times as well as a blot that happens to be round."""
-    return 1.0 / (1.0 + (dots.sigma.max(axis=1) / SHARP) ** 2) ** 2
+    """How much each counts, (D): a printed dot is located several times as well as a blot that happens to be round."""
+    return 1.0 / (1.0 + (dots.sigma.max(axis=1) / SHARP) ** 2) ** 3
 
 
 def _usual(figure: NDArray, quality: NDArray) -> float:
@@ -158,12 +159,15 @@ def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArra
     left[:, 2:9] = np.median(members.parameters[:, 2:9], axis=0)
     anew = fit_dots(image, np.concatenate([members.parameters, left]))
     first, more = anew[: len(members)], anew[len(members) :]
-    good, more = family.admits(first), more[family.admits(more)]
+    good, more = family.admits(first), more[family.admits(more) & more.within(image)]
     unlike = _unlike(more, members)
+    nearest = np.arange(min(AROUND, len(members))) + 1
+    level = members.parameters[cKDTree(members.centre).query(more.centre, nearest)[1], 9]
+    glossy = (unlike < STRANGE) & (more.parameters[:, 9] > GLOSSY * np.median(level, axis=1))
     kin, before = unlike < UNLIKE, -1
     while kin.sum() > before:  # each that is found lengthens lines
         before = int(kin.sum())
         known = np.concatenate([members.centre, more.centre[kin]])
         lines = np.array([lines_through(place, known) for place in more.centre], int)
-        kin |= (lines >= LINES) & (unlike < STRANGE)
+        kin |= (lines >= LINES) & glossy
     return apart(first[good].beside(members[~good]).beside(more[kin]), SAME_PLACE * family.radius)
