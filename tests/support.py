@@ -61,6 +61,12 @@ def picture(
     return np.clip(np.rint(level + np.random.default_rng(seed).normal(0, noise, level.shape)), 0, 255).astype(np.uint8)
 
 
+def grid(columns: int = 8, rows: int = 3) -> np.ndarray:
+    """The places (N, 2) of dots in rows, 34 px apart."""
+    x, y = np.meshgrid(40 + 34 * np.arange(columns), 80 + 34 * np.arange(rows))
+    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
+
+
 def hand_drawn(random: np.random.Generator, radius: float, waves: float) -> np.ndarray:
     """The outline (180, 2) of a dot drawn by hand about (0, 0), irregular by that share of its radius."""
     turn = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)

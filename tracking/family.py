@@ -24,7 +24,7 @@ SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
 STRANGE = 4.5  # likewise, though it stands where the family's rows go on: under a gloss a dot hardly looks like one
 AROUND, IN_LINE, LINES = 8, 0.12, 3  # nearest members, of their distance, and how many lines it then must stand in
-GLOSSY = 0.85  # of the surroundings of its neighbours: a gloss adds light, so that such a dot's are hardly darker
+DARKER = 0.15  # of its neighbours' light: a gloss adds some, so that such a dot's surroundings are hardly darker
 DIM, DIMMEST = 0.3, 0.15  # of the usual contrast; between them a dot must keep back as large a share of the light
 BLACKEST = 1.25  # shade: a dot that seems to keep back more than all light is none
 SPOT_SHARE, SPOT_LEAST = 0.3, 0.5  # of the usual and of the dimmest marker's contrast: what a spot must stand out by
@@ -162,8 +162,10 @@ def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArra
     good, more = family.admits(first), more[family.admits(more) & more.within(image)]
     unlike = _unlike(more, members)
     nearest = np.arange(min(AROUND, len(members))) + 1
-    level = members.parameters[cKDTree(members.centre).query(more.centre, nearest)[1], 9]
-    glossy = (unlike < STRANGE) & (more.parameters[:, 9] > GLOSSY * np.median(level, axis=1))
+    near = cKDTree(members.centre).query(more.centre, nearest)[1]
+    level = np.median(members.parameters[near, 9], axis=1)
+    light = np.maximum(level, level + family.contrast)
+    glossy = (unlike < STRANGE) & (level - more.parameters[:, 9] < DARKER * light)
     kin, before = unlike < UNLIKE, -1
     while kin.sum() > before:  # each that is found lengthens lines
         before = int(kin.sum())

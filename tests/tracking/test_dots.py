@@ -115,41 +115,6 @@ def test_a_dot_is_one_spot(radius: float, hurried: bool) -> None:
             assert np.linalg.norm(spots - (x, y), axis=1).min() < 0.7 * radius
 
 
-def before_a_wall(scene: Scene, pitch: float, radius: float, seed: int) -> tuple[int, int, int]:
-    """Of a body's dots in rows: how many there are, how many are found, and how many more are."""
-    assert scene.skin_box is not None
-    random = np.random.default_rng(seed)
-    left, top, right, bottom = scene.skin_box
-    x, y = np.meshgrid(
-        np.arange(left + 1.8 * radius, right - 1.7 * radius, pitch),
-        np.arange(top + 1.8 * radius, bottom - 1.7 * radius, pitch),
-    )
-    places = np.stack([x.ravel(), y.ravel()], axis=1) + random.uniform(-1, 1, (x.size, 2))
-    ellipses = np.column_stack([places, np.full((len(places), 2), radius), np.zeros(len(places))])
-    found = find_family(expose(draw(scene, ellipses, random), scene, random))
-    assert found is not None
-    gap = np.linalg.norm(found[1].centre[:, None] - places, axis=2)
-    return len(places), int((gap.min(axis=0) < 1).sum()), int((gap.min(axis=1) > 1).sum())
-
-
-@pytest.mark.parametrize("seed", [1, 4, 6])
-def test_blots_where_rows_go_on_are_no_dots(seed: int) -> None:
-    """They look less like dots than dots under a gloss do, but lie on darker ground, to which no light was added."""
-    skin = (100.0, 80.0, 540.0, 400.0)
-    scene = Scene(size=(640, 480), fine=4, skin_box=skin, clutter=30.0)
-    there, found, more = before_a_wall(scene, 24.0, 4.0, seed)
-    assert (found, more) == (there, 0)
-
-
-@pytest.mark.parametrize("seed", [2, 4, 6])
-def test_many_blots_do_not_outweigh_few_dots(seed: int) -> None:
-    """A dozen dots before a wall full of blots as large: hardly one in a hundred of these passes."""
-    scene = Scene(size=(960, 600), fine=4, skin=125.0, skin_box=(380.0, 260.0, 560.0, 330.0), clutter=40.0)
-    there, found, more = before_a_wall(scene, 30.0, 5.0, seed)
-    assert found == there
-    assert more < 4
-
-
 def test_nothing_in_an_empty_picture() -> None:
     assert len(all_dots(np.full((120, 160), 90, np.uint8), True)) == 0
     noise = np.random.default_rng(0).normal(90, 6, (240, 320)).astype(np.uint8)

@@ -2,16 +2,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
-from support import picture
+from support import grid, picture
 
 from groundwork import InputError
-from tracking.family import find_family
 from tracking.follow import follow
 from tracking.frame import Frame
-from tracking.tracker import Tracker
 from tracking.video import Reading
 
 SIZE = (360, 240)
@@ -42,11 +39,6 @@ class Drawn:
             look = {"blur": self.blur, "noise": self.noise, "contrast": self.contrast}
             lit = picture(dots, SIZE, seed=frame, **look) * self.light(frame)
             yield Frame(0.01 * frame, np.clip(np.rint(lit), 0, 255).astype(np.uint8))
-
-
-def grid(columns: int = 8, rows: int = 3) -> np.ndarray:
-    x, y = np.meshgrid(40 + 34 * np.arange(columns), 80 + 34 * np.arange(rows))
-    return np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
 
 
 def bent(rest: np.ndarray, tip: np.ndarray) -> np.ndarray:
@@ -248,69 +240,6 @@ def test_frames_before_the_first_that_shows_dots_are_missing() -> None:
     assert np.isnan(tracks.pixel[:4]).all()
     assert not tracks.damaged.any()
     assert np.abs(tracks.pixel[4:, order(tracks.start, truth[4])] - truth[4:]).max() < 0.3
-
-
-def test_the_family_is_the_dots_not_the_clutter() -> None:
-    """Six large blots and a row of small specks beside 24 dots of one size."""
-    rest = grid()
-    blots = [(30 + 50 * i, 30, 13.0, 10.0, 0.3) for i in range(6)]
-    specks = [(20 + 24 * i, 220, 3.0, 3.0, 0.0) for i in range(13)]
-    image = picture([*((x, y, 6.0, 6.0, 0.0) for x, y in rest), *blots, *specks], SIZE, noise=2.0)
-    found = find_family(image)
-    assert found is not None
-    family, dots = found
-    assert len(dots) == 24
-    assert family.dark
-    assert family.radius == pytest.approx(6.0, rel=0.05)
-    assert Tracker(family, dots).pattern.spacing == pytest.approx(34.0, abs=1.0)
-
-
-def test_the_family_is_not_the_background() -> None:
-    """Twelve dots on a bright skin before a mottled wall that is full of round blots."""
-    random = np.random.default_rng(2)
-    wall = np.full((480, 640), 70.0)
-    for size, strength in ((120, 35.0), (30, 25.0), (6, 12.0)):
-        coarse = random.normal(0.0, strength, (480 // size + 2, 640 // size + 2))
-        wall += cv2.resize(coarse, (640, 480), interpolation=cv2.INTER_CUBIC)
-    wall = np.clip(wall + random.normal(0, 3, wall.shape), 0, 255).astype(np.uint8)
-    skin = picture([(x, y, 9.0, 9.0, 0.0) for x, y in grid(6, 2)], (260, 150), noise=3.0)
-    wall[160:310, 200:460] = skin
-    found = find_family(wall)
-    assert found is not None
-    dots = found[1]
-    assert len(dots) == 12
-    distance = np.linalg.norm(dots.centre[:, None] - (grid(6, 2) + np.array([200, 160]))[None], axis=2)
-    assert distance.min(axis=1).max() < 0.2
-
-
-def test_stains_of_the_skin_are_no_markers() -> None:
-    """Dim dots on a skin so mottled that it shows more round stains than there are dots."""
-    dots = 100 + grid()
-    false = 0
-    for seed in range(12):
-        random = np.random.default_rng(seed)
-        skin = picture([(x, y, 6.0, 6.0, 0.0) for x, y in dots], (640, 480), noise=2.0, seed=seed, contrast=60.0)
-        mottled = skin + cv2.resize(random.normal(0.0, 8.0, (62, 82)), (640, 480), interpolation=cv2.INTER_CUBIC)
-        found = find_family(np.clip(np.rint(mottled), 0, 255).astype(np.uint8))
-        assert found is not None
-        away = np.linalg.norm(found[1].centre[:, None] - dots, axis=2)
-        assert away.min(axis=0).max() < 1.0  # what lies around a dot pulls it
-        false += len(found[1]) - 24
-    assert false <= 10
-
-
-@pytest.mark.parametrize("row", [80, 114, 182])
-@pytest.mark.parametrize("beside", [-6.0, 6.0])
-def test_markers_under_a_gloss_stand_in_the_others_rows(row: int, beside: float) -> None:
-    """A streak of light as wide as a dot runs along a row, two thirds as bright as the dots are dark."""
-    rest = grid(8, 4)
-    image = picture([(x, y, 6.0, 6.0, 0.0) for x, y in rest], (360, 260), noise=2.0)
-    streak = 90.0 * np.exp(-(((np.arange(260)[:, None] - row - beside) / 9.0) ** 2))
-    found = find_family(np.clip(np.rint(image + streak), 0, 255).astype(np.uint8))
-    assert found is not None
-    away = np.linalg.norm(found[1].centre[:, None] - rest, axis=2)
-    assert away.min(axis=1).max() < 1.0
-    assert (away.min(axis=0) < 1.0).sum() >= 31
 
 
 def test_too_few_dots_are_refused() -> None:
