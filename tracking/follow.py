@@ -14,9 +14,10 @@ from groundwork import InputError
 from tracking.dots import Dots, eight_bits
 from tracking.family import find_family
 from tracking.frame import Frame
+from tracking.memory import Memory
 from tracking.newcomers import Newcomer
 from tracking.noise import places_and_errors
-from tracking.tracker import Tracker
+from tracking.tracker import FEW_SHAPES, Tracker
 from tracking.video import Video
 
 Array = NDArray[Any]
@@ -34,7 +35,7 @@ class PixelTracks:
         time: [s], (T), NaN where the video does not say.
         pixel: (T, D, 2), NaN where not measured; where the coding is known, as the others' motion mends it.
         sigma: one standard deviation along x and y [px], (T, D, 2).
-        start: positions in the first frame that shows markers [px], (D, 2); of late ones where the others carry them.
+        start: positions in the first frame that shows markers [px], (D, 2); of late ones where the others put them.
         late: how many markers, the last ones, came into sight later.
         damaged: frames that could not be decoded, (T).
         pictures: the first frame and the worst ten, by number, as JPEG.
@@ -98,10 +99,12 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     with ThreadPoolExecutor(1) as aside:
         pictures = aside.submit(album.pictures)
         paths, sigma = places_and_errors(*_whole(seen, late, len(tracker.pattern.rest)))
+    start = tracker.pattern.rest
+    if late:
+        start = _with_late_ones(start, paths, np.arange(len(start)) >= len(start) - len(late), tracker.marks.known)
     return PixelTracks(
-        np.array(times), paths, sigma, tracker.pattern.rest, len(late), np.array(damaged),
-        pictures.result(), tuple(reading.notes),
-    )  # fmt: skip
+        np.array(times), paths, sigma, start, len(late), np.array(damaged), pictures.result(), tuple(reading.notes)
+    )
 
 
 @dataclass(frozen=True)
@@ -144,6 +147,25 @@ def _whole(seen: list[Sight], late: list[Newcomer], count: int) -> tuple[Array, 
         for frame, (pixel, sigma) in newcomer.seen.items():
             paths[frame, column], fitted[frame, column] = pixel, sigma
     return paths, fitted, leverage, step, np.array([sight.lag for sight in seen])
+
+
+def _with_late_ones(start: Array, paths: Array, late: NDArray[np.bool_], marks: NDArray[np.bool_]) -> Array:
+    """Where markers were in the first picture [px], (D, 2): the late ones (D) as in all shapes that showed everybody.
+
+    What was thought of one when it came into sight rests on a body bent otherwise.
+
+    Args:
+        start: where they were, late ones by what was thought [px], (D, 2).
+        paths: all that was seen [px], (T, D, 2).
+        late: who came into sight later, (D).
+        marks: who does not ride on the body, (D).
+    """
+    memory = Memory(start)
+    for place in paths[np.isfinite(paths[..., 0]).all(axis=1)]:
+        memory.add(place, np.ones(len(start), bool))
+    if len(memory) < FEW_SHAPES:
+        return start
+    return np.where((late & ~marks)[:, None], memory.carried(start, ~late & ~marks).place, start)
 
 
 class _Album:

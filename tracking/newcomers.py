@@ -193,14 +193,12 @@ class Newcomers:
         self, candidate: Candidate, pattern: Pattern, parameters: Array, spacing: float
     ) -> Newcomer | None:
         """The candidate in the last pictures; None where too few since its first look show it, or several dots."""
-        always = len(self._recent[0].place)  # those known in all of the pictures: more of them put it elsewhere
-        memory = Memory(np.concatenate([pattern.rest[:always], np.median(candidate.rest, axis=0)[None]]))
-        carried = {then.number: _carried(memory, then, always) for then in self._recent}
+        first = candidate.looks[0].frame
+        carried = self._carried(pattern.rest, np.median(candidate.rest, axis=0), first)
         if not candidate.rides():  # followed where it is in the picture, not where it seems to be on the body
             carried = dict.fromkeys(carried, np.zeros(2))
         looks = [look for look in candidate.looks if look.frame in carried]
         frames, stray = [look.frame for look in looks], np.array([look.place - carried[look.frame] for look in looks])
-        first = candidate.looks[0].frame
         seen: dict[int, tuple[Array, Array]] = {}
         shown = np.full(PARAMETERS, np.nan)
         since = lost = 0
@@ -230,6 +228,28 @@ class Newcomers:
             return None
         home = self._home(pattern, seen)
         return None if home is None else Newcomer(*home, shown, seen)
+
+    def _carried(self, rest: Array, own: Array, first: int) -> dict[int, Array]:
+        """Where the markers put a dot in the last pictures [px], (2), by frame.
+
+        Always the same markers since its first look, as more of them put it elsewhere; where fewer were known before,
+        those carry it on from there.
+
+        Args:
+            rest: where markers belong in the pattern [px], (M, 2).
+            own: where the dot does [px], (2).
+            first: frame of its first look.
+        """
+        count = min(len(then.place) for then in self._recent if then.number >= first)
+        memory, off = Memory(np.concatenate([rest[:count], own[None]])), np.zeros(2)
+        carried: dict[int, Array] = {}
+        for then, later in zip(reversed(self._recent), [None, *reversed(self._recent)], strict=False):
+            if later is not None and len(then.place) < count:
+                count = len(then.place)
+                memory = Memory(np.concatenate([rest[:count], own[None]]))
+                off = carried[later.number] - _carried(memory, later, count)
+            carried[then.number] = _carried(memory, then, count) + off
+        return carried
 
     def _home(self, pattern: Pattern, seen: dict[int, tuple[Array, Array]]) -> tuple[Array, float] | None:
         """Where in the pattern a dot belongs, and how well that is known [px], by its places and sigma by frame.

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import grid, picture
+from support import curled, grid, picture
 
 from groundwork import InputError
 from tracking.follow import follow
@@ -205,6 +205,23 @@ def test_dots_hidden_at_first_beside_the_clamp_are_taken_in(tip: float) -> None:
     match = order(tracks.start, truth[0])
     assert sorted(match) == list(range(24))
     assert np.linalg.norm(tracks.start[match] - truth[0], axis=1).max() < 5.0
+    assert np.nanmax(np.linalg.norm(tracks.pixel[:, match] - truth, axis=2)) < 0.3
+    assert np.isfinite(tracks.pixel[-1]).all()
+
+
+@pytest.mark.parametrize("speed", [0.2, 0.3, 0.4])
+def test_a_tip_hidden_at_first_is_put_where_it_was(speed: float) -> None:
+    """Beyond what is in sight a strip curls as nobody could foretell; later it is seen to curl so again."""
+    curls = [curled(0.14 * np.cos(speed * frame)) for frame in range(100)]
+    truth = np.array(curls) + np.array([60.0, 118.0])
+    places = truth.copy()
+    places[:15, 6:] = np.nan
+    places[:40, 12:] = np.nan
+    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 8
+    match = order(tracks.start, truth[0])
+    assert sorted(match) == list(range(14))
+    assert np.linalg.norm(tracks.start[match] - truth[0], axis=1).max() < 2.0
     assert np.nanmax(np.linalg.norm(tracks.pixel[:, match] - truth, axis=2)) < 0.3
     assert np.isfinite(tracks.pixel[-1]).all()
 
