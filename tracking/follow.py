@@ -160,12 +160,12 @@ def _with_late_ones(start: Array, paths: Array, late: NDArray[np.bool_], marks: 
         late: who came into sight later, (D).
         marks: who does not ride on the body, (D).
     """
-    memory = Memory(start)
+    memory, telling = Memory(start), ~late & ~marks
     for place in paths[np.isfinite(paths[..., 0]).all(axis=1)]:
         memory.add(place, np.ones(len(start), bool))
-    if len(memory) < FEW_SHAPES:
+    if len(memory) < FEW_SHAPES or not telling.any():
         return start
-    return np.where((late & ~marks)[:, None], memory.carried(start, ~late & ~marks).place, start)
+    return np.where((late & ~marks)[:, None], memory.carried(start, telling).place, start)
 
 
 class _Album:

@@ -194,7 +194,7 @@ class Newcomers:
     ) -> Newcomer | None:
         """The candidate in the last pictures; None where too few since its first look show it, or several dots."""
         first = candidate.looks[0].frame
-        carried = self._carried(pattern.rest, np.median(candidate.rest, axis=0), first)
+        carried = self._carried_since(pattern.rest, np.median(candidate.rest, axis=0), first)
         if not candidate.rides():  # followed where it is in the picture, not where it seems to be on the body
             carried = dict.fromkeys(carried, np.zeros(2))
         looks = [look for look in candidate.looks if look.frame in carried]
@@ -229,7 +229,7 @@ class Newcomers:
         home = self._home(pattern, seen)
         return None if home is None else Newcomer(*home, shown, seen)
 
-    def _carried(self, rest: Array, own: Array, first: int) -> dict[int, Array]:
+    def _carried_since(self, rest: Array, own: Array, first: int) -> dict[int, Array]:
         """Where the markers put a dot in the last pictures [px], (2), by frame.
 
         Always the same markers since its first look, as more of them put it elsewhere; where fewer were known before,
