@@ -156,38 +156,47 @@ def localisation(random: np.random.Generator, quick: bool) -> Iterator[Row]:
 
 
 def compression(case: Case, random: np.random.Generator, quick: bool) -> Iterator[Row]:
-    """A video of 105 dots that swing together, up to 1 or up to 27 px a frame, compressed and followed.
+    """Videos of 105 dots that swing together, up to 1 or up to 27 px a frame, compressed and followed.
 
-    By an encoder that searches well, which is what is asked for, and by one that is in a hurry.
+    By an encoder that searches well, which is what is asked for, and by one that is in a hurry. All dots of a video
+    share much of their errors, so one alone says little of how many are covered.
     """
-    kinds = [
-        (f"{case.name}, {preset}, {speed}", swing, preset)
-        for preset in ("medium", "veryfast")
-        for speed, swing in (("slow", 2.2), ("fast", 60.0))
-    ]
-    for name, swing, preset in kinds:
-        ellipses, _ = scattered(replace(case, radius=1.5 * case.radius), random)
-        ellipses[:, 2:4] = case.radius
-        frames = 48 if quick else 120
-        amount = swing * (ellipses[:, 0] / 1280.0) ** 2
-        phase = random.uniform(0, 6) + 0.45 * np.arange(frames)
-        truth = np.repeat(ellipses[None, :, :2], frames, axis=0)
-        truth[..., 1] += 30.0 + amount * np.sin(phase)[:, None]
-        pictures = []
-        for t in range(frames):
-            smear = np.zeros((len(ellipses), 2))
-            smear[:, 1] = case.exposure * amount * 0.45 * np.cos(phase[t])
-            here = np.column_stack([truth[t], ellipses[:, 2:]])
-            pictures.append(expose(draw(replace(case.scene, fine=4), here, random, smear), case.scene, random))
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "a.mp4"
-            write_video(path, pictures, "h264", {"crf": "23", "preset": preset})
-            tracks = follow(open_video(path), lambda: None)
-        order = np.linalg.norm(truth[0][:, None] - tracks.start[None], axis=2).argmin(axis=1)
-        error, sigma = tracks.pixel[:, order] - truth, tracks.sigma[:, order]
-        rms, reported = (float(np.sqrt(np.nanmean(values**2))) for values in (error, sigma))
-        yield Row("RMS error [px]", name, rms, "<= 0.055")
-        yield Row("reported sigma / RMS error", name, reported / rms, "0.75 to 1.25")
-        yield Row("within one sigma [%]", name, 100 * float((np.abs(error) < sigma).mean()), "64 to 72")
-        silent = (np.abs(error) > 0.25) & (np.abs(error) > 4 * sigma)
-        yield Row("off by > 0.25 px in silence", name, int(silent.sum()), "0")
+    films = 1 if quick else 4
+    for preset in ("medium", "veryfast"):
+        for speed, swing in (("slow", 2.2), ("fast", 60.0)):
+            name = f"{case.name}, {preset}, {speed}"
+            filmed = [compressed(case, preset, swing, 48 if quick else 120, random) for _ in range(films)]
+            error, sigma = (np.stack(values) for values in zip(*filmed, strict=True))
+            rms, reported = (float(np.sqrt(np.nanmean(values**2))) for values in (error, sigma))
+            yield Row("RMS error [px]", name, rms, "<= 0.055")
+            yield Row("reported sigma / RMS error", name, reported / rms, "0.75 to 1.25")
+            covered = 100 * (np.abs(error) < sigma).mean(axis=(1, 2, 3))
+            yield Row("within one sigma [%]", name, float(covered.mean()), "64 to 72")
+            yield Row("  least in a video", name, float(covered.min()))
+            yield Row("  most in a video", name, float(covered.max()))
+            silent = (np.abs(error) > 0.25) & (np.abs(error) > 4 * sigma)
+            yield Row("off by > 0.25 px in silence", name, int(silent.sum()), "0")
+
+
+def compressed(
+    case: Case, preset: str, swing: float, frames: int, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Errors and sigma of the dots of a compressed video [px], (T, D, 2) each."""
+    ellipses, _ = scattered(replace(case, radius=1.5 * case.radius), random)
+    ellipses[:, 2:4] = case.radius
+    amount = swing * (ellipses[:, 0] / 1280.0) ** 2
+    phase = random.uniform(0, 6) + 0.45 * np.arange(frames)
+    truth = np.repeat(ellipses[None, :, :2], frames, axis=0)
+    truth[..., 1] += 30.0 + amount * np.sin(phase)[:, None]
+    pictures = []
+    for t in range(frames):
+        smear = np.zeros((len(ellipses), 2))
+        smear[:, 1] = case.exposure * amount * 0.45 * np.cos(phase[t])
+        here = np.column_stack([truth[t], ellipses[:, 2:]])
+        pictures.append(expose(draw(replace(case.scene, fine=4), here, random, smear), case.scene, random))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.mp4"
+        write_video(path, pictures, "h264", {"crf": "23", "preset": preset})
+        tracks = follow(open_video(path), lambda: None)
+    order = np.linalg.norm(truth[0][:, None] - tracks.start[None], axis=2).argmin(axis=1)
+    return tracks.pixel[:, order] - truth, tracks.sigma[:, order]
