@@ -6,7 +6,7 @@ import pytest
 from support import picture
 
 from tracking.follow import follow
-from tracking.noise import LAGGING, POWER, Others, places_and_errors, with_shared_errors
+from tracking.noise import LAGGING, POWER, STILL, Others, coding_errors, places_and_errors, with_shared_errors
 from tracking.video import open_video
 
 
@@ -49,17 +49,28 @@ def test_errors_no_picture_shows_are_found(random: np.random.Generator) -> None:
 
 @pytest.mark.parametrize("error", [0.03, 0.08])
 def test_the_others_mend_what_coding_moved(random: np.random.Generator, error: float) -> None:
-    """An eighth of the errors' variance all markers have in common, along the body's motion, which nobody can mend."""
-    state = random.bit_generator.state
-    pixel = paths(random, np.full(20, np.sqrt(0.875) * error))
-    random.bit_generator.state = state
+    """A sixteenth of the errors' variance all have in common, along the body's motion, which nobody can mend."""
     truth = paths(random, np.zeros(20))
-    shape = np.linalg.svd(truth.reshape(200, -1), full_matrices=False)[2][0].reshape(20, 2) * np.sqrt(40)
-    pixel += random.normal(size=(200, 1, 1)) * shape * np.sqrt(0.125) * error
+    ways = np.linalg.svd(truth.transpose(1, 0, 2), full_matrices=False)[2][:, 0]
+    shape = np.linalg.svd(truth.reshape(200, -1), full_matrices=False)[2][0].reshape(20, 2) * np.sqrt(20)
+    pixel = truth + random.normal(size=(200, 20, 1)) * ways * np.sqrt(15.0) / 4.0 * error
+    pixel += random.normal(size=(200, 1, 1)) * shape * 0.25 * error
     place, sigma = coded(pixel, error)
     off = np.sqrt(np.mean((place - truth) ** 2))
     assert off < 0.5 * error
     assert np.sqrt(np.mean(sigma**2)) == pytest.approx(off, rel=0.2)
+
+
+def test_coding_lags_along_the_way(random: np.random.Generator) -> None:
+    """By 0.1 px, of markers that go at 30 degrees; of two that hardly move, the others' way tells."""
+    reach = np.append(random.uniform(2.0, 20.0, 18), [0.02, 0.02])
+    pixel = reach[:, None] * np.array([np.sqrt(0.75), 0.5]) * np.sin(0.45 * np.arange(200))[:, None, None]
+    pixel += 0.01 * random.normal(size=pixel.shape)
+    leverage, fitted = np.full(pixel.shape, (0.1 / LAGGING) ** (1.0 / POWER) / 16.0), np.full(pixel.shape, 0.02)
+    square = coding_errors(pixel, fitted, leverage, np.full((200, 20), 16.0)) ** 2
+    still = (STILL * 0.02) ** 2
+    np.testing.assert_allclose(square.sum(axis=2) - still, 0.1**2, rtol=1e-6)
+    np.testing.assert_allclose((square[..., 0] - still) / (square[..., 1] - still), 3.0, rtol=0.15)
 
 
 def test_markers_that_turn_round_wait_together(random: np.random.Generator) -> None:
@@ -108,7 +119,7 @@ def test_a_marker_that_seems_still_on_a_body_that_moves_may_move(random: np.rand
         pixel = swing * paths(random, np.zeros(20)) + random.normal(size=(200, 20, 2)) * 0.02
         pixel[:, 3] = random.normal(size=(200, 2)) * 0.005
         sigmas.append(coded(pixel, 0.1)[1][:, 3])
-    assert np.median(sigmas[1]) > 1.3 * np.median(sigmas[0])
+    assert np.median(sigmas[1]) > 1.15 * np.median(sigmas[0])
 
 
 def test_a_marker_that_moves_on_its_own_stays_where_it_was_seen(random: np.random.Generator) -> None:
@@ -216,6 +227,6 @@ def test_sigma_knows_of_compression(tmp_path: Path, codec: str, options: dict[st
     error, sigma = tracks.pixel[:, order] - place, tracks.sigma[:, order]
     # Encoders do not write the same twice, and of fine coding, whose error is 0.004 px, too much is expected.
     known = codec == "libx264" and options["crf"] != "4"
-    assert 0.7 < np.sqrt((sigma**2).mean() / (error**2).mean()) < (1.8 if known else 2.2)
+    assert 0.7 < np.sqrt((sigma**2).mean() / (error**2).mean()) < (1.8 if known else 2.5)
     assert np.mean(np.abs(error) < sigma) == pytest.approx(0.68, abs=0.14 if known else 0.24)
     assert np.mean((np.abs(error) > 0.25) & (np.abs(error) > 4.0 * sigma)) < 5e-3
