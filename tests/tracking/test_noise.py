@@ -226,7 +226,11 @@ def test_sigma_knows_of_compression(tmp_path: Path, codec: str, options: dict[st
     order = np.linalg.norm(place[0][:, None] - tracks.start[None], axis=2).argmin(axis=1)
     error, sigma = tracks.pixel[:, order] - place, tracks.sigma[:, order]
     # Encoders do not write the same twice, and of fine coding, whose error is 0.004 px, too much is expected.
-    known = codec == "libx264" and options["crf"] != "4"
-    assert 0.7 < np.sqrt((sigma**2).mean() / (error**2).mean()) < (1.8 if known else 2.5)
-    assert np.mean(np.abs(error) < sigma) == pytest.approx(0.68, abs=0.14 if known else 0.24)
+    ratio, covered = np.sqrt((sigma**2).mean() / (error**2).mean()), np.mean(np.abs(error) < sigma)
+    if codec == "libx264" and options["crf"] != "4":
+        assert 0.7 < ratio < 1.5
+        assert 0.54 < covered < 0.82
+    else:
+        assert 0.7 < ratio < 3.0
+        assert 0.44 < covered < 0.97
     assert np.mean((np.abs(error) > 0.25) & (np.abs(error) > 4.0 * sigma)) < 5e-3
