@@ -163,7 +163,7 @@ def speed(random: np.random.Generator, quick: bool) -> Iterator[Row]:
                 follow(video, lambda: None)  # compiles
                 case = f"{size[1]}p {codec}, {frames} frames"
                 times: dict[str, list[float]] = {"decode": [], "all cores": [], "track": []}
-                for _ in range(5):
+                for _ in range(12):  # on a shared machine few are undisturbed
                     for kind, work in (("decode", decode_only), ("all cores", decode_threads), ("track", track_only)):
                         begun = time.perf_counter()
                         work(video)
