@@ -7,6 +7,7 @@ from rafl.lanes import KERNEL
 from rafl.scratch import DEFORMATION, STRETCH, TEMPORARY, U, V
 
 SAFE_DETERMINANT = 0.05  # below it a lane is decomposed on its own, with care
+TINY = 1e-100  # of the largest stretch: the square of a smaller one is rounded to few digits, or to nought
 
 
 @njit(**KERNEL)
@@ -61,7 +62,7 @@ def signed_svd(F, U, s, V):  # type: ignore[no-untyped-def]
     for i in range(3):
         B[i, 0] /= s[0]
     along = B[0, 0] * B[0, 1] + B[1, 0] * B[1, 1] + B[2, 0] * B[2, 1]
-    if s[1] > 0.0 and abs(along) < 1e-8 * s[1]:
+    if s[1] > TINY * s[0] and abs(along) < 1e-8 * s[1]:
         for i in range(3):
             B[i, 1] /= s[1]
     else:  # rank one, the second column nought or rounding: any direction across the first serves

@@ -39,7 +39,9 @@ def test_signed_svd(entries: list[float]) -> None:
 
 def test_svd_of_special_matrices() -> None:
     one_row = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.6423473344796382, 0.5]])
-    for F in (np.eye(3), -np.eye(3), np.diag([2.0, 2.0, 1.0]), np.diag([1.0, 0.0, 0.0]), np.ones((3, 3)), one_row):
+    tiny = np.array([[0.0, 9.8e-160, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    flat = np.diag([1.0, 0.0, 0.0])
+    for F in (np.eye(3), -np.eye(3), np.diag([2.0, 2.0, 1.0]), flat, np.ones((3, 3)), one_row, tiny):
         left, s, right = svd(F)
         np.testing.assert_allclose(left @ np.diag(s) @ right.T, F, atol=1e-14)
         np.testing.assert_allclose(left @ left.T, np.eye(3), atol=1e-14)
