@@ -23,7 +23,7 @@ STILL, LAGGING, POWER = 1.69, 0.346, 0.664
 # still, and by so many powers of e more before and after frames to which a marker moves less than SLOW of these errors:
 # where markers turn round, they wait together until the encoder takes notice. Measured on 200 films of six presets of
 # x264 at crf 14 to 30, otherwise as above, of bodies that swing, are let go or move in three modes along any direction.
-SHARED, WAITING, SLOW = 0.033, 3.0, 8.0
+SHARED, WAITING, SLOW = 0.030, 3.0, 8.0
 # The share of markers that move by more than these errors from which on others may move too, unseen by the encoder.
 FEW = 0.05
 # So many of the variances of errors across its way tell as much of a marker's direction as its path does.
@@ -31,9 +31,8 @@ UNDIRECTED = 4.0
 # So many of the errors of an encoder in a hurry a marker moves from frame to frame where haste does half its harm.
 # Measured on 48 films of x264's presets from superfast to fast.
 FAST = 13.0
-# So many times the variance of these errors may still be error, not the body's own motion; and so many times the errors
-# themselves may, together, pass for a mode of it.
-EXCESS, PASSING = 2.0, 2.0
+# So many times these errors may, together, pass for a mode of the body's own motion.
+PASSING = 2.0
 # By whose motion places are mended; and errors told, if it has no more modes than may be taken off.
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
 FEW_FRAMES, FEW_MARKERS = 12, 4
@@ -283,16 +282,12 @@ def mendable(pixel: Array, fitted: Array, coding: Array, others: Others, coarse:
     # What the others do not tell of the body's motion, and what their errors make of their prediction.
     carried = others.carried + (others.leverage / (1.0 - others.leverage))[..., None]
 
-    def errors(variance: Array) -> tuple[Array, Array, Array]:
-        """Variances of a marker's own errors, of those it shares, and of the others' prediction."""
-        hidden = np.maximum(variance - shown, 0.0)
-        own = np.where(square > 0.0, shown + alone * hidden, 0.0)
-        return own, (1.0 - alone) * hidden, carried * (shown + hidden).mean(axis=0)
-
-    own, _, least = errors(EXCESS * square)
+    # Variances of a marker's own errors, of those it shares, and of the others' prediction.
+    hidden = np.maximum(square - shown, 0.0)
+    own, shared = np.where(square > 0.0, shown + alone * hidden, 0.0), (1.0 - alone) * hidden
+    least = carried * (shown + hidden).mean(axis=0)
     beyond = np.maximum(others.missed - own.mean(axis=0), 0.0)
     part = own / np.maximum(own + np.maximum(beyond, least), (others.away / SURPRISING) ** 2)
-    own, shared, least = errors(square)
     # Where the others leave less of all paths together than these errors would be, the errors are smaller; but for
     # markers that keep still, whose errors keep still with them and are not seen.
     left = (others.missed / (1.0 + others.carried)).mean(axis=0)
