@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+import av
 import cv2
 import h5py
 import numpy as np
@@ -12,7 +13,7 @@ from support import SHARED, Run
 
 from tracking.follow import follow
 from tracking.frame import Frame
-from tracking.video import Reading
+from tracking.video import Reading, open_video
 
 FOLDER = SHARED / "real" / "sway_frame"
 pytestmark = [
@@ -95,3 +96,23 @@ def test_a_bar_that_passes_takes_no_names_with_it(down: bool) -> None:
     behind = np.abs(free.pixel[..., int(down)] - middle[:, None]) < half + 15
     behind[0] = False
     assert np.isfinite(error[~behind]).mean() > 0.995
+
+
+def test_sigma_knows_what_compression_does_to_it(tmp_path: Path) -> None:
+    """Coded again by H.264, it is off from where it was by as much as sigma says."""
+    before = follow(Barred(), lambda: None)  # type: ignore[arg-type]
+    path = tmp_path / "a.mkv"
+    with av.open(str(path), "w") as output:
+        stream = output.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt, stream.options = 1300, 2046, "yuv420p", {"crf": "23"}
+        for shown in Barred().frames():
+            frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(shown.picture), format="gray")
+            output.mux(stream.encode(frame.reformat(format="yuv420p", dst_color_range="MPEG")))
+        output.mux(stream.encode())
+    coded = follow(open_video(path), lambda: None)
+    order = np.linalg.norm(before.start[:, None] - coded.start, axis=2).argmin(axis=1)
+    error, sigma = coded.pixel[:, order] - before.pixel, coded.sigma[:, order]
+    assert np.sqrt((error**2).mean()) < 0.06
+    assert 0.75 < np.sqrt((sigma**2).mean() / (error**2).mean()) < 1.35
+    assert 0.6 < np.mean(np.abs(error) < sigma) < 0.8
+    assert np.mean((np.abs(error) > 0.25) & (np.abs(error) > 4.0 * sigma)) < 3e-3
