@@ -21,7 +21,7 @@ STILL, LAGGING, POWER = 1.69, 0.346, 0.664
 # Of these errors' variance, what all markers have in common against what each has alone: times the step over the noise
 # of the first picture, by so much less as the errors are larger than those along an axis in which the marker keeps
 # still, and by so many powers of e more before and after frames to which a marker moves less than SLOW of these errors:
-# where markers turn round, they wait together until the encoder takes notice. Measured on 200 films of six presets of
+# where markers turn round, they wait together until the encoder takes notice. Measured on 260 films of six presets of
 # x264 at crf 14 to 30, otherwise as above, of bodies that swing, are let go or move in three modes along any direction.
 SHARED, WAITING, SLOW = 0.030, 3.0, 8.0
 # The share of markers that move by more than these errors from which on others may move too, unseen by the encoder.

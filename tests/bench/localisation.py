@@ -110,7 +110,7 @@ def localisation(random: np.random.Generator, quick: bool) -> Iterator[Row]:
         errors, sigmas, bounds, theirs, blobs = [], [], [], [], []
         false = total = 0
         pictures, truths = [], []
-        for _ in range(1 if quick else 3):
+        for _ in range(1 if quick else 8):
             ellipses, smear = scattered(case, random)
             clean = draw(case.scene, ellipses, random, smear)
             pictures.append(expose(clean, case.scene, random))
