@@ -25,7 +25,7 @@ LEAST_CONTRAST = 12.0  # grey levels
 LEAST_SIGMA = 1e-3  # px: below it the model's own error counts
 SHARED_NOISE = 1.25  # variance by blocks over that by independent errors, beyond which errors are shared
 ENOUGH_FOR_TWO = 64  # dots, to fit half of them in another thread; with fewer, decoding takes longer than fitting
-FIGURES = 10  # of a dot, that follow from its fit
+FIGURES = 11  # of a dot, that follow from its fit
 SMALL = 1.9  # px: radius of dots that are still found in a picture made small in a hurry
 SAME_PLACE = 0.6  # radii: two dots closer than this are one
 SHADES = 0.2  # of a shade's logarithm: dots that differ by less may be alike, however much light falls on them
@@ -50,6 +50,7 @@ class Dots:
         leverage: what a grey level of independent noise in every pixel moves the centre by [px], (D, 2).
         residual: root mean square, as a share of the contrast, (D).
         misfit: likewise without the pixels' own noise, where that matters, (D).
+        grain: likewise of what neighbouring pixels' residuals do not share, (D).
         used: share of the pixels that the fit trusted, (D).
     """
 
@@ -63,6 +64,7 @@ class Dots:
     leverage: Array
     residual: Array
     misfit: Array
+    grain: Array
     used: Array
 
     def __len__(self) -> int:
@@ -97,7 +99,7 @@ class Dots:
         nan = np.full(count, np.nan)
         pair = np.full((count, 2), np.nan)
         parameters = np.full((count, PARAMETERS), np.nan)
-        return cls(pair, pair.copy(), parameters, nan, nan, nan, nan, pair.copy(), nan, nan, nan)
+        return cls(pair, pair.copy(), parameters, nan, nan, nan, nan, pair.copy(), nan, nan, nan, nan)
 
 
 @njit(cache=True)
@@ -130,12 +132,16 @@ def _fit_some(image, start, first, last, wary, fitted, figures):  # type: ignore
 
 @njit(cache=True, nogil=True)
 def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
-    """Fills what `Dots` says of one fit: sigma (2), leverage (2), radius, flattening, residual, used, vague, misfit."""
+    """Fills what `Dots` says of one fit.
+
+    In order: sigma (2), leverage (2), radius, flattening, residual, used, vague, misfit, grain.
+    """
     figures[0:2] = np.nan
     figures[2], figures[3] = np.sqrt(quality[1]), np.sqrt(quality[2])
     figures[4], figures[5], figures[8] = np.nan, 0.0, np.nan
     figures[6], figures[7] = np.sqrt(quality[5]) / max(abs(p[8]), 1e-12), quality[6]
     figures[9] = np.sqrt(quality[5] - quality[10]) / max(abs(p[8]), 1e-12)
+    figures[10] = np.sqrt(quality[11]) / max(abs(p[8]), 1e-12)
     determinant = p[2] * p[4] - p[3] * p[3]
     mean = 0.5 * (p[2] + p[4])
     if not (quality[0] > 0.0 and determinant > 0.0 and mean > 0.0):
@@ -174,6 +180,7 @@ def fit_dots(image: NDArray, start: Array, wanted: int | None = None, wary: bool
         leverage=figures[:, 2:4],
         residual=figures[:, 6],
         misfit=figures[:, 9],
+        grain=figures[:, 10],
         used=figures[:, 7],
     )
 

@@ -158,6 +158,7 @@ def _fit(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
         p[5], p[6], p[7] = p[5] + p[6] ** 2 / 12.0, p[6] * p[7] / 12.0, p[5] + p[7] ** 2 / 12.0
     if quality[5] > (ASKED * p[8]) ** 2:
         quality[10] = min(_noise(RESIDUAL, count, w) ** 2, quality[5])
+    quality[11] = _grain(count, w)
     quality[0] = 1.0
     return False
 
@@ -233,6 +234,19 @@ def _noise(row, count, w):  # type: ignore[no-untyped-def]
         w[SIZE + found] = abs(w[row + k] - w[row + k - 1])
         found += int(beside)
     return 1.4826 / np.sqrt(2.0) * np.median(w[SIZE : SIZE + max(found, 1)])
+
+
+@njit(**FAST)
+def _grain(count, w):  # type: ignore[no-untyped-def]
+    """The variance of what the residuals of pixels side by side in a line do not share, as they are trusted."""
+    count = min(count, LARGEST)
+    square, pairs = np.float32(0.0), np.float32(0.0)
+    for k in range(1, count):
+        beside = (w[Y + k] == w[Y + k - 1]) & (w[X + k] - w[X + k - 1] < np.float32(2.5))
+        trust = w[WEIGHT + k] * w[WEIGHT + k - 1] if beside else np.float32(0.0)
+        square += trust * (w[RESIDUAL + k] - w[RESIDUAL + k - 1]) ** 2
+        pairs += trust
+    return 0.5 * square / max(pairs, np.float32(1.0))
 
 
 @njit(**AS_WRITTEN)

@@ -16,7 +16,7 @@ from tracking.family import find_family
 from tracking.frame import Frame
 from tracking.memory import Memory
 from tracking.newcomers import Newcomer
-from tracking.noise import places_and_errors
+from tracking.noise import places_and_errors, share_of_noise
 from tracking.tracker import FEW_SHAPES, Tracker
 from tracking.video import Video
 
@@ -67,6 +67,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     late: list[Newcomer] = []
     damaged: list[bool] = []
     most = 0
+    noise = 1.0
     tracker: Tracker | None = None
     album = _Album()
     reading = video.read()
@@ -79,6 +80,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
             most = max(most, 0 if found is None else len(found[1]))
             if found is not None and len(found[1]) >= FEWEST_MARKERS:
                 tracker = Tracker(*found)
+                noise = share_of_noise(found[1].grain, found[1].residual)
                 sight = Sight.of(tracker.looks.judge(frame.picture, found[1]), frame)
         elif frame.picture is not None and tracker is not None:
             sight = Sight.of(tracker.advance(frame.picture), frame)
@@ -98,7 +100,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
         )
     with ThreadPoolExecutor(1) as aside:
         pictures = aside.submit(album.pictures)
-        paths, sigma = places_and_errors(*_whole(seen, late, len(tracker.pattern.rest)))
+        paths, sigma = places_and_errors(*_whole(seen, late, len(tracker.pattern.rest)), noise)
     start = tracker.pattern.rest
     if late:
         start = _with_late_ones(start, paths, np.arange(len(start)) >= len(start) - len(late), tracker.marks.known)

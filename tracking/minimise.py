@@ -23,8 +23,9 @@ from tracking.normal_equations import add_scores, factorise, normal_equations, s
 
 # Converged; the centre's variances by independent errors of one grey level (2), by blocks (2); mean squared residual;
 # share used; how far the pixels that are not quite trusted pull the centre (2); the variance of A's mean diagonal by
-# independent errors of one grey level; the pixels' own noise's variance, where the residual is large enough to ask.
-QUALITY = 11
+# independent errors of one grey level; the pixels' own noise's variance, where the residual is large enough to ask; the
+# variance of what neighbouring pixels' residuals do not share.
+QUALITY = 12
 # Steps that leave the normal matrix nearly as it was: of the centre and of the radius [px], and the share by which the
 # contrast and the edge's variance may change.
 CLOSE, SWELLING, CHANGE = 1.0, 0.3, 0.05

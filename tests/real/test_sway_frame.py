@@ -109,7 +109,7 @@ def test_sigma_knows_what_compression_does_to_it(tmp_path: Path) -> None:
     measured = np.isfinite(error)
     assert measured.mean() > 0.995
     error, sigma = error[measured], sigma[measured]
-    assert np.sqrt((error**2).mean()) < 0.08
+    assert np.sqrt((error**2).mean()) < 0.06
     assert 0.75 < np.sqrt((sigma**2).mean() / (error**2).mean()) < 1.35
     assert 0.6 < np.mean(np.abs(error) < sigma) < 0.8
     assert np.mean((np.abs(error) > 0.25) & (np.abs(error) > 4.0 * sigma)) < 3e-3

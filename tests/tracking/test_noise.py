@@ -3,10 +3,20 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from support import picture
+from support import hand_drawn, outlined, picture
 
+from tracking.dots import fit_dots, start_of
 from tracking.follow import follow
-from tracking.noise import LAGGING, POWER, STILL, Others, coding_errors, places_and_errors, with_shared_errors
+from tracking.noise import (
+    LAGGING,
+    POWER,
+    STILL,
+    Others,
+    coding_errors,
+    places_and_errors,
+    share_of_noise,
+    with_shared_errors,
+)
 from tracking.video import open_video
 
 
@@ -29,7 +39,7 @@ def coded(pixel: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray]:
     step = 16.0
     leverage = np.full(pixel.shape, (error / LAGGING) ** (1.0 / POWER) / step)
     fitted = np.where(np.isnan(pixel), np.nan, 0.3 * step * leverage)  # noise of a third of the step
-    return places_and_errors(pixel, fitted, leverage, np.full(pixel.shape[:2], step), np.ones(len(pixel)))
+    return places_and_errors(pixel, fitted, leverage, np.full(pixel.shape[:2], step), np.ones(len(pixel)), 1.0)
 
 
 def test_honest_fits_are_left_alone(random: np.random.Generator) -> None:
@@ -59,6 +69,36 @@ def test_the_others_mend_what_coding_moved(random: np.random.Generator, error: f
     off = np.sqrt(np.mean((place - truth) ** 2))
     assert off < 0.5 * np.sqrt(np.mean((pixel - truth) ** 2))
     assert np.sqrt(np.mean(sigma**2)) == pytest.approx(off, rel=0.2)
+
+
+def test_dots_that_are_no_discs_leave_more_than_noise(random: np.random.Generator) -> None:
+    """Of dots drawn by hand the fits leave what moves along with them, of discs noise only."""
+    shares = []
+    for waves in (0.0, 0.1):
+        centres = np.array([(40.0 + 60.0 * k, 40.0) for k in range(10)]) + random.uniform(-0.5, 0.5, (10, 2))
+        outlines = [hand_drawn(random, 10.0, waves) + centre for centre in centres]
+        image = np.mean([outlined(outlines, (620, 80), random) for _ in range(8)], axis=0).astype(np.float32)
+        starts = [start_of(x, y, np.array([0.1, 0.0, 0.1]), -120.0, 170.0) for x, y in centres]
+        dots = fit_dots(image, np.array(starts))
+        shares.append(share_of_noise(dots.grain, dots.residual))
+    assert shares[0] == 1.0
+    assert shares[1] < 0.9
+
+
+def test_what_moves_along_with_dots_makes_no_place_worse(random: np.random.Generator) -> None:
+    """A body with small motions of its own, which errors as large as these fits' could be taken for."""
+    time, error = np.arange(200), 0.02
+    ways = random.normal(size=(6, 20, 2)) * np.array([40.0, 5.0, 1.0, 0.05, 0.05, 0.05])[:, None, None]
+    truth = np.einsum("kt,kdi->tdi", np.sin(np.arange(1, 7)[:, None] * 0.17 * time), ways)
+    pixel = truth + random.normal(size=truth.shape) * error
+    step, fitted = np.full((200, 20), 4.0), np.full(pixel.shape, 0.06)
+    leverage = np.full(pixel.shape, (error / LAGGING) ** (1.0 / POWER) / 4.0)
+    off = []
+    for noise in (1.0, 0.2):
+        place, sigma = places_and_errors(pixel, fitted, leverage, step, np.ones(200), noise)
+        off.append(np.sqrt(np.mean((place - truth) ** 2)))
+    assert off[0] > 1.5 * error > 1.5 * off[1]
+    assert np.sqrt(np.mean(sigma**2)) == pytest.approx(off[1], rel=0.35)
 
 
 def test_coding_lags_along_the_way(random: np.random.Generator) -> None:
@@ -102,7 +142,7 @@ def test_slow_motion_lags_in_haste(random: np.random.Generator, swing: float) ->
     step, fitted = 15.0, 0.03
     leverage = np.full(pixel.shape, (0.05 / LAGGING) ** (1.0 / POWER) / step)
     place, sigma = places_and_errors(
-        pixel, np.full(pixel.shape, fitted), leverage, np.full((201, 20), step), np.where(between, 4.0, 1.5)
+        pixel, np.full(pixel.shape, fitted), leverage, np.full((201, 20), step), np.where(between, 4.0, 1.5), 1.0
     )
     usual = np.sqrt((sigma[..., 1] ** 2).mean(axis=1))
     if swing < 100.0:
@@ -138,7 +178,7 @@ def test_places_stay_where_nothing_is_known_of_the_coding(random: np.random.Gene
     pixel[50:60, 4] = np.nan
     sigma = np.where(np.isnan(pixel), np.nan, 0.05)
     place, _ = places_and_errors(
-        pixel, sigma, np.full(pixel.shape, 0.01), np.full(pixel.shape[:2], np.nan), np.ones(200)
+        pixel, sigma, np.full(pixel.shape, 0.01), np.full(pixel.shape[:2], np.nan), np.ones(200), 1.0
     )
     np.testing.assert_array_equal(place, pixel)
 
@@ -149,7 +189,7 @@ def test_a_place_far_off_says_so_and_no_other_does(random: np.random.Generator) 
     pixel[77, 8, 1] += 16.0
     sigma = np.full(pixel.shape, 0.05)
     unknown = np.full(pixel.shape, np.nan)
-    place, found = places_and_errors(pixel, sigma, unknown, unknown[..., 0], np.ones(200))
+    place, found = places_and_errors(pixel, sigma, unknown, unknown[..., 0], np.ones(200), 1.0)
     np.testing.assert_array_equal(place, pixel)
     assert found[77, 8, 1] > 4.0
     found[77, 8, 1] = np.nan
