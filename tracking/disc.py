@@ -28,6 +28,10 @@ J = 8 * LARGEST  # a chunk's derivatives by the parameters, 12 rows, and its res
 WEIGHTED = J + 13 * CHUNK  # two rows
 SCRATCH = WEIGHTED + 2 * CHUNK
 LEAST_BLUR, MOST_BLUR = 0.08, 40.0  # of W along any direction [px^2]
+# How far from the outline a fit looks: so many standard deviations of a blurred edge and a share of the radius, but no
+# farther than so many radii and px, or so many standard deviations past the end of a smear's way: the edge of a sticker
+# that the dot is on would pass for its blur.
+REACHED, MARGIN, FARTHEST, PAST_END = 3.0, 0.3, (0.5, 5.0), 1.5
 REACH = 4.0  # half the bell curve's support, in standard deviations
 
 # The bell (1 - z^2 / 16)^8 on |z| < 4 is close to exp(-z^2 / 2) and integrates to an odd polynomial.
@@ -59,8 +63,11 @@ def choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
     if not half - spread > 0.01:
         return 0
     smallest, largest = 1.0 / (half + spread), 1.0 / (half - spread)
-    edge = 3.0 * np.sqrt(max(0.5 * (p[5] + p[7]), 0.5)) + 1.0
-    margin = (1.0 + edge) / smallest + 0.3
+    mean, smeared = 0.5 * (p[5] + p[7]), np.sqrt(0.25 * (p[5] - p[7]) ** 2 + p[6] * p[6])
+    way_end = 0.5 * np.sqrt(24.0 * smeared) + PAST_END * np.sqrt(max(mean - smeared, 0.0))
+    farthest = max(FARTHEST[0] * smallest + FARTHEST[1], way_end - MARGIN * smallest)
+    edge = min(REACHED * np.sqrt(max(mean, 0.5)) + 1.0, farthest)
+    margin = (1.0 + edge) / smallest + MARGIN
     inside, outside, end = max(1.0 - edge / smallest, 0.0) ** 2, (1.0 + edge / smallest) ** 2, (1.0 + margin) ** 2
     window = int(largest * (1.0 + margin)) + 1
     # |A d|^2 = along (dx + lean dy)^2 + across dy^2

@@ -37,6 +37,8 @@ FEW_SHAPES = 6  # remembered, by which nothing is told
 FRESH = 3  # frames out of sight, over which a marker's own motion still tells where it is
 STRAYING = 1.5  # so many times as uncertain as where a marker is believed is where it will be next
 ELSEWHERE, TOLD = 0.3, 0.3  # radii from where it was expected, and spacings to which that is known, to look again
+# Misfit, of the contrast, from which a dot's own last look is doubted, and for how many frames after its first.
+ODD, YOUNG = 0.1, 8
 RECHECK = 4  # frames between searches for markers out of sight
 
 
@@ -55,10 +57,13 @@ class Tracker:
         self.searched = 0  # frames since the last search
         self.newcomers = Newcomers(family, np.zeros(len(first)))
         self.looks = WholeLooks.none(len(first))
+        self.young = np.full(len(first), YOUNG)
+        self.misled = np.zeros(len(first), bool)  # by their own last looks: fits start from the usual one
         self.outlines = Outlines(first)
 
     def advance(self, image: NDArray) -> Dots:
         """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
+        self.young -= 1
         guess = self._guess()
         followed, expected = self._seen() & (self.doubt == 0.0), guess.place
         if not (followed | self.marks.known).all():
@@ -99,6 +104,8 @@ class Tracker:
             self.motion.join(self._lately(newcomer, number))
             self.marks.join()
             self.looks.join()
+            self.misled = np.append(self.misled, False)
+            self.young = np.append(self.young, YOUNG)
             self.outlines.join()
             self.pattern = Pattern.of(np.concatenate([self.pattern.rest, newcomer.rest[None]]))
             self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
@@ -160,12 +167,40 @@ class Tracker:
     def _where_expected(self, image: NDArray, expected: Array) -> Dots | None:
         """The dots at the markers' expected places; None where they are not all their own."""
         start = self.parameters.copy()
+        if self.misled.any():
+            start[self.misled] = start_of(0.0, 0.0, *self._usual_look())
         start[:, :2] = expected
         dots = fit_dots(image, start)
         good = self.family.admits(dots)
+        if (self.young > 0).any() and not (good & (dots.misfit < ODD)).all():
+            dots = self._without_their_last_looks(image, dots, good, start)
+            good = self.family.admits(dots)
         same = SAME_PLACE * self.family.radius
         calm = _own(dots.parameters, self.parameters, expected, self._seen(), self.pattern.spacing, same, good)
         return _only(dots, good) if calm else None
+
+    def _without_their_last_looks(self, image: NDArray, dots: Dots, good: NDArray[np.bool_], start: Array) -> Dots:
+        """The dots, odd ones as fits from the usual look find them, where these leave less; which is how they stay.
+
+        A dot's own last look may take the edge of its sticker, or a strip of gloss, for its blur; now and then to start
+        from it would make it jump.
+        """
+        odd = np.flatnonzero(self._seen() & (self.young > 0) & ~self.misled & ~(good & (dots.misfit < ODD)))
+        if not len(odd):
+            return dots
+        anew = start[odd]
+        anew[:] = start_of(0.0, 0.0, *self._usual_look())
+        anew[:, :2] = start[odd, :2]
+        found = fit_dots(image, np.concatenate([anew, np.delete(start, odd, axis=0)]), len(odd))
+        better = np.flatnonzero(self.family.admits(found) & ~(found.misfit > dots.misfit[odd]))
+        self.misled[odd[better]] = True
+        rows = np.arange(len(dots))
+        rows[odd[better]] = len(dots) + better
+        return dots.beside(found)[rows]
+
+    def _usual_look(self) -> tuple[Array, float, float]:
+        """The markers' usual shape, contrast and level."""
+        return np.median(self.parameters[:, 2:5], axis=0), self.family.contrast, float(np.median(self.parameters[:, 9]))
 
     def _search(self, image: NDArray, expected: Array) -> tuple[Dots, NDArray[np.bool_]]:
         """Every dot near the body, matched to the markers all at once, and which can be no other marker's."""
@@ -174,12 +209,11 @@ class Tracker:
         margin = (SEED_REACH + 1.0) * float(np.median(self.pattern.spacing)) + 2.0 * self.family.radius
         margin *= uncertain
         low, high = expected.min(0) - margin, expected.max(0) + margin
-        shape = np.median(self.parameters[:, 2:5], axis=0)
-        level = float(np.median(self.parameters[:, 9]))
+        look = self._usual_look()
         region = int(low[0]), int(low[1]), int(high[0]), int(high[1])
         least = self.family.least(float(np.nanmin(np.abs(self.parameters[:, 8]))))
         spots = find_spots(image, self.family.radius, least, region)
-        starts = [start_of(x, y, shape, self.family.contrast, level) for x, y in spots]
+        starts = [start_of(x, y, *look) for x, y in spots]
         dots = fit_dots(image, np.array(starts).reshape(-1, PARAMETERS))
         dots = apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
         speed = np.linalg.norm(expected - self.motion.last, axis=1) / self.pattern.spacing
