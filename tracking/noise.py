@@ -33,7 +33,7 @@ UNDIRECTED = 4.0
 FAST = 13.0
 # So many times these errors may, together, pass for a mode of the body's own motion.
 PASSING = 2.0
-LEAST_GRAIN = 0.6  # see `share_of_noise`
+LEAST_GRAIN, SMOOTHEST = 0.6, 0.5  # see `share_of_noise`; and what share of the former counts at least
 # By whose motion places are mended; and errors told, if it has no more modes than may be taken off.
 FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
 FEW_FRAMES, FEW_MARKERS = 12, 4
@@ -51,7 +51,8 @@ def share_of_noise(grain: Array, residual: Array) -> float:
     Of what neighbouring pixels' residuals do not share, (D), over all of them, (D). Fits of discs in coded pictures
     have 0.6 to 1 of it, of dots drawn by hand but for noise 0.45 to 0.55.
     """
-    return min(float(np.median(grain / residual)) / LEAST_GRAIN, 1.0) ** 2
+    share = np.divide(grain, residual, out=np.ones_like(grain), where=residual > 0.0)
+    return float(np.clip(np.median(share) / LEAST_GRAIN, SMOOTHEST, 1.0)) ** 2
 
 
 def places_and_errors(
