@@ -57,13 +57,14 @@ class Tracker:
         self.searched = 0  # frames since the last search
         self.newcomers = Newcomers(family, np.zeros(len(first)))
         self.looks = WholeLooks.none(len(first))
-        self.young = np.full(len(first), YOUNG)
+        self.frame, self.youth_ends = 0, YOUNG
+        self.born = np.zeros(len(first), dtype=np.int64)  # frame in which each was seen first
         self.misled = np.zeros(len(first), bool)  # by their own last looks: fits start from the usual one
         self.outlines = Outlines(first)
 
     def advance(self, image: NDArray) -> Dots:
         """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
-        self.young -= 1
+        self.frame += 1
         guess = self._guess()
         followed, expected = self._seen() & (self.doubt == 0.0), guess.place
         if not (followed | self.marks.known).all():
@@ -105,7 +106,7 @@ class Tracker:
             self.marks.join()
             self.looks.join()
             self.misled = np.append(self.misled, False)
-            self.young = np.append(self.young, YOUNG)
+            self.born, self.youth_ends = np.append(self.born, self.frame), self.frame + YOUNG
             self.outlines.join()
             self.pattern = Pattern.of(np.concatenate([self.pattern.rest, newcomer.rest[None]]))
             self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
@@ -172,7 +173,7 @@ class Tracker:
         start[:, :2] = expected
         dots = fit_dots(image, start)
         good = self.family.admits(dots)
-        if (self.young > 0).any() and not (good & (dots.misfit < ODD)).all():
+        if self.frame < self.youth_ends and not (good & (dots.misfit < ODD)).all():
             dots = self._without_their_last_looks(image, dots, good, start)
             good = self.family.admits(dots)
         same = SAME_PLACE * self.family.radius
@@ -185,7 +186,8 @@ class Tracker:
         A dot's own last look may take the edge of its sticker, or a strip of gloss, for its blur; now and then to start
         from it would make it jump.
         """
-        odd = np.flatnonzero(self._seen() & (self.young > 0) & ~self.misled & ~(good & (dots.misfit < ODD)))
+        young = self.frame - self.born < YOUNG
+        odd = np.flatnonzero(self._seen() & young & ~self.misled & ~(good & (dots.misfit < ODD)))
         if not len(odd):
             return dots
         anew = start[odd]
