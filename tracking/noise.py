@@ -70,7 +70,7 @@ def places_and_errors(
             not known.
         step: by which the picture was rounded there [grey levels], (T, D), NaN where not known: as in other frames.
         lag: so many times coarser than these steps each frame is where nothing moves fast, (T).
-        noise: share of `fitted` that is.
+        noise: share of `fitted` that is noise, see `share_of_noise`.
     """
     known = everywhere(step)
     haste = harm_of_haste(pixel, leverage, known, lag)

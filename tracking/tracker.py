@@ -37,7 +37,7 @@ FEW_SHAPES = 6  # remembered, by which nothing is told
 FRESH = 3  # frames out of sight, over which a marker's own motion still tells where it is
 STRAYING = 1.5  # so many times as uncertain as where a marker is believed is where it will be next
 ELSEWHERE, TOLD = 0.3, 0.3  # radii from where it was expected, and spacings to which that is known, to look again
-# Misfit, of the contrast, from which a dot's own last look is doubted, and for how many frames after its first.
+# Misfit, of the contrast, from which a dot's own last look is doubted, and in how many pictures after it is known.
 ODD, YOUNG = 0.1, 8
 RECHECK = 4  # frames between searches for markers out of sight
 
@@ -57,14 +57,14 @@ class Tracker:
         self.searched = 0  # frames since the last search
         self.newcomers = Newcomers(family, np.zeros(len(first)))
         self.looks = WholeLooks.none(len(first))
-        self.frame, self.youth_ends = 0, YOUNG
-        self.born = np.zeros(len(first), dtype=np.int64)  # frame in which each was seen first
+        self.pictures = 0  # followed so far
+        self.since = np.zeros(len(first), dtype=np.int64)  # how many had been when each was known
         self.misled = np.zeros(len(first), bool)  # by their own last looks: fits start from the usual one
         self.outlines = Outlines(first)
 
     def advance(self, image: NDArray) -> Dots:
         """The markers' dots (D) in the next picture, sigma NaN where a marker is not seen."""
-        self.frame += 1
+        self.pictures += 1
         guess = self._guess()
         followed, expected = self._seen() & (self.doubt == 0.0), guess.place
         if not (followed | self.marks.known).all():
@@ -106,7 +106,7 @@ class Tracker:
             self.marks.join()
             self.looks.join()
             self.misled = np.append(self.misled, False)
-            self.born, self.youth_ends = np.append(self.born, self.frame), self.frame + YOUNG
+            self.since = np.append(self.since, self.pictures)
             self.outlines.join()
             self.pattern = Pattern.of(np.concatenate([self.pattern.rest, newcomer.rest[None]]))
             self.parameters = np.concatenate([self.parameters, newcomer.parameters[None]])
@@ -173,7 +173,7 @@ class Tracker:
         start[:, :2] = expected
         dots = fit_dots(image, start)
         good = self.family.admits(dots)
-        if self.frame < self.youth_ends and not (good & (dots.misfit < ODD)).all():
+        if self.pictures < self.since[-1] + YOUNG and not (good & (dots.misfit < ODD)).all():
             dots = self._without_their_last_looks(image, dots, good, start)
             good = self.family.admits(dots)
         same = SAME_PLACE * self.family.radius
@@ -186,7 +186,7 @@ class Tracker:
         A dot's own last look may take the edge of its sticker, or a strip of gloss, for its blur; now and then to start
         from it would make it jump.
         """
-        young = self.frame - self.born < YOUNG
+        young = self.pictures < self.since + YOUNG
         odd = np.flatnonzero(self._seen() & young & ~self.misled & ~(good & (dots.misfit < ODD)))
         if not len(odd):
             return dots
@@ -194,11 +194,9 @@ class Tracker:
         anew[:] = start_of(0.0, 0.0, *self._usual_look())
         anew[:, :2] = start[odd, :2]
         found = fit_dots(image, np.concatenate([anew, np.delete(start, odd, axis=0)]), len(odd))
-        better = np.flatnonzero(self.family.admits(found) & ~(found.misfit > dots.misfit[odd]))
+        better = self.family.admits(found) & ~(found.misfit > dots.misfit[odd])
         self.misled[odd[better]] = True
-        rows = np.arange(len(dots))
-        rows[odd[better]] = len(dots) + better
-        return dots.beside(found)[rows]
+        return _replaced(dots, odd[better], found[better])
 
     def _usual_look(self) -> tuple[Array, float, float]:
         """The markers' usual shape, contrast and level."""
@@ -254,9 +252,7 @@ class Tracker:
         found = fit_dots(image, starts, len(asked))
         gap = np.linalg.norm(found.centre[:, None] - dots.centre[shown], axis=2).min(axis=1)
         good = self.family.admits(found) & (gap > SAME_PLACE * self.family.radius)
-        rows = np.arange(len(dots))
-        rows[asked[good]] = len(dots) + np.flatnonzero(good)
-        return dots.beside(found)[rows]
+        return _replaced(dots, asked[good], found[good])
 
     def _undisputed(self, dots: Dots, agreed: NDArray[np.bool_], guess: Belief) -> NDArray[np.bool_]:
         """Which markers are seen, and not by dots that could as well be another's.
@@ -296,6 +292,13 @@ class Tracker:
         self.motion.remember(place, back)
         self.missing = np.where(seen, 0, self.missing + 1)
         self.parameters[seen] = dots.parameters[seen]
+
+
+def _replaced(dots: Dots, rows: NDArray[np.int64], others: Dots) -> Dots:
+    """The dots, others in these rows (K)."""
+    chosen = np.arange(len(dots))
+    chosen[rows] = len(dots) + np.arange(len(rows))
+    return dots.beside(others)[chosen]
 
 
 @njit(cache=True)
