@@ -24,6 +24,7 @@ SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
 STRANGE = 4.5  # likewise, though it stands where the family's rows go on: under a gloss a dot hardly looks like one
 AROUND, IN_LINE, LINES = 8, 0.12, 3  # nearest members, of their distance, and how many lines it then must stand in
+NEXT = 1.5  # of a member's distance to its third nearest: farther from all no row goes on, though lines lead there
 DARKER = 0.15  # of its neighbours' light: a gloss adds some, so that such a dot's surroundings are hardly darker
 DIM, DIMMEST = 0.3, 0.15  # of the usual contrast; between them a dot must keep back as large a share of the light
 BLACKEST = 1.25  # shade: a dot that seems to keep back more than all light is none
@@ -166,10 +167,11 @@ def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArra
     level = np.median(members.parameters[near, 9], axis=1)
     light = np.maximum(level, level + family.contrast)
     glossy = (unlike < STRANGE) & (level - more.parameters[:, 9] < DARKER * light)
+    step = float(np.median(cKDTree(members.centre).query(members.centre, nearest[:4])[0][:, -1]))
     kin, before = unlike < UNLIKE, -1
     while kin.sum() > before:  # each that is found lengthens lines
         before = int(kin.sum())
         known = np.concatenate([members.centre, more.centre[kin]])
         lines = np.array([lines_through(place, known) for place in more.centre], int)
-        kin |= (lines >= LINES) & glossy
+        kin |= (lines >= LINES) & (cKDTree(known).query(more.centre)[0] < NEXT * step) & glossy
     return apart(first[good].beside(members[~good]).beside(more[kin]), SAME_PLACE * family.radius)

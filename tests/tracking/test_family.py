@@ -71,6 +71,20 @@ def test_markers_under_a_gloss_stand_in_the_others_rows(row: int, beside: float)
     assert (away.min(axis=0) < 1.0).sum() >= 31
 
 
+@pytest.mark.parametrize("away", [3, 4])
+@pytest.mark.parametrize("blur", [3.1, 3.4])
+def test_lines_do_not_reach_far_beyond_the_dots(away: int, blur: float) -> None:
+    """A blurred blot where the rows would go on, but some pitches from the last dot: many lines lead there."""
+    rest = grid(8, 4)
+    column = rest[:, 0].max() + 34.0 * away
+    image = picture([(x, y, 6.0, 6.0, 0.0) for x, y in rest], (480, 260), noise=2.0)
+    x, y = np.meshgrid(np.arange(480) - column, np.arange(260) - 114.0)
+    blot = cv2.GaussianBlur((x**2 + y**2 < 6.8**2).astype(float), (0, 0), blur)
+    found = find_family(np.clip(np.rint(image - 100.0 * blot), 0, 255).astype(np.uint8))
+    assert found is not None
+    assert len(found[1]) == len(rest)
+
+
 def before_a_wall(scene: Scene, pitch: float, radius: float) -> tuple[int, int]:
     """Of a body's dots in rows, in eight pictures: how many are not found, and how many more are."""
     assert scene.skin_box is not None
