@@ -11,7 +11,7 @@ Array = NDArray[Any]
 
 LOOKS, MOVING = 5, 0.5  # looks that show a moving dot before it is believed, and px: root mean square way of one
 CARRIED = 0.5  # of that way: how far it may move on the body the while
-LONG, LEAST = 15, 0.15  # looks and px: likewise, of a dot that hardly moves
+LONG, LEAST = 15, 0.05  # looks and px: likewise, of a dot that hardly moves
 MODES, ALONE = 2, 0.1  # ways of the body to move, and of the variance of such a dot's way: what these may not explain
 ASTRAY = 0.4, 0.6  # of the way of the marker that moves most: how far it may seem to move on the body; if explained
 STEADY = 1.0  # px: root mean square way of what stands still, though the camera may not
@@ -86,7 +86,8 @@ class Candidate:
         free = len(self.looks) - 1
         unexplained = (left**2).sum() / (free - MODES) / ((own**2).sum() / free)
         span = (ASTRAY[1] - ASTRAY[0]) * most
-        return bool(unexplained * span < ALONE * min(span, ASTRAY[1] * most - _spread(self.rest)))
+        explained = unexplained * span < ALONE * min(span, ASTRAY[1] * most - _spread(self.rest))
+        return bool(most > STEADY and explained)
 
 
 def _spread(places: Array) -> float:

@@ -32,6 +32,7 @@ FREE = 0.55  # spacings: how far on the body from known markers there may be ano
 FAR = 2.4  # breadths: how far from them at most
 BESIDE = 0.5  # sine of the angle from the line to its nearest neighbour, from which on one stands beside a marker
 NEAR = 0.45  # spacings: how far from a candidate the same dot may seem to be at the next look
+UNRIVALLED = 2.0  # times as far: likewise, where no other dot or candidate is nearer than twice the gap
 SAME = 0.3  # spacings: how far from where it is expected a dot that is followed back may be
 FARTHER, BLUR = 2.0, 0.5  # times as far as between its looks, and px: likewise before its first look
 LOST = 2  # pictures before its first look without it, one after the other: there it was not in sight yet
@@ -171,8 +172,8 @@ class Newcomers:
         before = self._candidates
         gaps = np.array([[item.gap(*dot) for item in before] for dot in zip(rest, found, strict=True)])
         gaps = gaps.reshape(len(found), len(before))
-        pairs = zip(*linear_sum_assignment(np.minimum(gaps, most)), strict=True)
-        known = {row: before[column] for row, column in pairs if gaps[row, column] < most}
+        pairs = zip(*linear_sum_assignment(np.minimum(gaps, UNRIVALLED * most)), strict=True)
+        known = {row: before[column] for row, column in pairs if _matches(gaps, row, column, most)}
         self._candidates = [known.get(row, Candidate()) for row in range(len(found))]
         for item, own, place in zip(self._candidates, rest, found, strict=True):
             item.looks.append(Look(now.number, own, place, now.place))
@@ -264,6 +265,12 @@ class Newcomers:
                 unlike = np.hypot(_bent(pattern.rest[body], then.place[body]), sigma[0])
                 beliefs.append((float(unlike), then.number, place[0], float(sigma[0])))
         return min(beliefs)[2:] if beliefs else None
+
+
+def _matches(gaps: Array, row: int, column: int, most: float) -> bool:
+    """Whether of the gaps between dots and candidates (D, C) this is none: a small one, or the only one near."""
+    rivals = np.append(np.delete(gaps[row], column), np.delete(gaps[:, column], row))
+    return bool(gaps[row, column] < min(max(most, 0.5 * rivals.min(initial=np.inf)), UNRIVALLED * most))
 
 
 def _carried(memory: Memory, then: _Earlier, count: int) -> Array:

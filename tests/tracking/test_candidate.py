@@ -19,13 +19,14 @@ def candidate(place: np.ndarray, rest: np.ndarray) -> Candidate:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_what_hardly_moves_is_carried_if_it_moves_with_the_body(seed: int) -> None:
-    """By 0.5 px, where the others put it to within 4 px only."""
+@pytest.mark.parametrize("way", [0.1, 0.5])
+def test_what_hardly_moves_is_carried_if_it_moves_with_the_body(seed: int, way: float) -> None:
+    """By so many pixels, where the others put it to within 4 px only."""
     random = np.random.default_rng(seed)
-    way = 0.5 * np.sin(1.1 * np.arange(20))[:, None] * [0.3, 1.0]
+    ways = way * np.sin(1.1 * np.arange(20))[:, None] * [0.3, 1.0]
     rest = random.normal(0.0, 2.0, (20, 2))
-    with_it = candidate(way + random.normal(0.0, 0.03, way.shape), rest)
-    alone = candidate(random.normal(0.0, 0.35, way.shape), rest)
+    with_it = candidate(ways + random.normal(0.0, 0.06 * way, ways.shape), rest)
+    alone = candidate(random.normal(0.0, 0.7 * way, ways.shape), rest)
     assert with_it.carried()
     assert not alone.carried()
 
@@ -48,6 +49,17 @@ def test_beside_a_body_that_keeps_still_nothing_is_carried() -> None:
     for frame in range(20):
         item.looks.append(Look(frame, np.zeros(2), random.normal(0.0, 0.3, 2), np.array([[0.0, 0.0], [30.0, 0.0]])))
     assert not item.carried()
+
+
+def test_what_moves_with_a_body_that_keeps_still_shakes_with_the_camera() -> None:
+    item, moving = Candidate(), Candidate()
+    for frame in range(20):
+        shake = np.array([0.4 * np.sin(1.1 * frame), 0.0])
+        body = np.array([[0.0, 0.0], [30.0, 0.0]])
+        item.looks.append(Look(frame, np.zeros(2), shake, body + shake))
+        moving.looks.append(Look(frame, np.zeros(2), shake, body + 5.0 * shake))
+    assert not item.carried()
+    assert moving.carried()
 
 
 def test_what_is_carried_far_is_known_after_a_few_looks() -> None:

@@ -209,6 +209,18 @@ def test_dots_hidden_at_first_beside_the_clamp_are_taken_in(tip: float) -> None:
     assert np.isfinite(tracks.pixel[-1]).all()
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_dot_put_by_hand_beside_the_clamp_is_taken_in(seed: int) -> None:
+    """It moves by 0.1 px, and stands in no row."""
+    rest = grid() + np.random.default_rng(seed).uniform(-6.0, 6.0, (24, 2))
+    truth = bent(rest, 2.4 * np.cos(0.4 * np.arange(90)))
+    places = truth.copy()
+    places[:20, 1] = np.nan
+    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 1
+    assert np.linalg.norm(tracks.start[-1] - truth[0, 1]) < 1.0
+
+
 @pytest.mark.parametrize("speed", [0.2, 0.3, 0.4])
 def test_a_tip_hidden_at_first_is_put_where_it_was(speed: float) -> None:
     """Beyond what is in sight a strip curls as nobody could foretell; later it is seen to curl so again."""
@@ -223,6 +235,20 @@ def test_a_tip_hidden_at_first_is_put_where_it_was(speed: float) -> None:
     assert sorted(match) == list(range(14))
     assert np.linalg.norm(tracks.start[match] - truth[0], axis=1).max() < 2.0
     assert np.nanmax(np.linalg.norm(tracks.pixel[:, match] - truth, axis=2)) < 0.3
+    assert np.isfinite(tracks.pixel[-1]).all()
+
+
+@pytest.mark.parametrize("speed", [0.6, 0.65, 0.7])
+def test_a_fast_tip_hidden_at_first_is_known_again_from_look_to_look(speed: float) -> None:
+    """It goes three spacings a frame, and seems to be anywhere on the body within one."""
+    truth = np.array([curled(0.2 * np.cos(speed * frame)) for frame in range(90)]) + np.array([60.0, 118.0])
+    places = truth.copy()
+    places[:20, 8:] = np.nan
+    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 6
+    match = order(tracks.start, truth[0])
+    assert sorted(match) == list(range(14))
+    assert np.nanmax(np.linalg.norm(tracks.pixel[:, match] - truth, axis=2)) < 1.0
     assert np.isfinite(tracks.pixel[-1]).all()
 
 
