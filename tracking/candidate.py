@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-LOOKS, MOVING = 5, 0.5  # looks that show a moving dot before it is believed, and px: root mean square way of one
-CARRIED = 0.5  # of that way: how far it may move on the body the while
+LOOKS = 5  # that show a moving dot before it is believed
+CARRIED = 0.5  # of its way: how far it may move on the body the while
 LONG, LEAST = 15, 0.05  # looks and px: likewise, of a dot that hardly moves
 MODES, ALONE = 2, 0.1  # ways of the body to move, and of the variance of such a dot's way: what these may not explain
 ASTRAY = 0.4, 0.6  # of the way of the marker that moves most: how far it may seem to move on the body; if explained
@@ -59,7 +59,7 @@ class Candidate:
     def carried(self) -> bool:
         """Whether the looks show that the body carries it."""
         way, stray = _spread(self.place), _spread(self.rest)
-        if len(self.looks) >= LOOKS and way > MOVING and stray < CARRIED * way:
+        if len(self.looks) >= LOOKS and way > STEADY and stray < CARRIED * way:
             return True
         return len(self.looks) >= LONG and way > LEAST and self._sways()
 

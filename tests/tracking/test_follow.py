@@ -277,6 +277,17 @@ def test_what_stands_still_behind_the_body_is_not_taken_in(period: int) -> None:
     assert tracks.late == 0
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_shakes_with_the_camera_beside_the_clamp_is_not_taken_in(seed: int) -> None:
+    """Dots that come into sight late; the clamped end of the body shakes just so."""
+    truth = bent(grid(), 25.0 * np.sin(2 * np.pi * np.arange(80) / 25))
+    blots = np.tile([[12.0, 55.0], [10.0, 100.0], [16.0, 135.0], [30.0, 215.0], [50.0, 30.0]], (80, 1, 1))
+    blots[:5] = np.nan
+    shake = np.random.default_rng(seed).normal(0.0, 0.45, (80, 1, 2))
+    tracks = follow(Drawn(np.concatenate([truth, blots], axis=1) + shake), lambda: None)  # type: ignore[arg-type]
+    assert tracks.late == 0
+
+
 def test_frames_before_the_first_that_shows_dots_are_missing() -> None:
     truth = np.concatenate([np.full((4, 24, 2), np.nan), np.repeat(grid()[None], 3, axis=0)])
     tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
