@@ -190,6 +190,11 @@ def start_of(x: float, y: float, shape: Array, contrast: float, level: float) ->
     return np.array([x, y, *shape, 1.2, 0.0, 1.2, contrast, level, 0.0, 0.0])
 
 
+def starts_at(places: Array, shape: Array, contrast: float, level: float) -> Array:
+    """Those of fits (D, 12) at places (D, 2), all alike but for these."""
+    return np.array([start_of(x, y, shape, contrast, level) for x, y in places]).reshape(-1, PARAMETERS)
+
+
 def eight_bits(image: NDArray) -> NDArray[np.uint8]:
     """A picture as OpenCV's filters want it."""
     return image if image.dtype == np.uint8 else np.clip(image, 0, 255).astype(np.uint8)

@@ -24,7 +24,8 @@ SHARP = 0.08  # px: a localisation error that a printed dot stays under
 UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
 STRANGE = 4.5  # likewise, though it stands where the family's rows go on: under a gloss a dot hardly looks like one
 AROUND, IN_LINE, LINES = 8, 0.12, 3  # nearest members, of their distance, and how many lines it then must stand in
-NEXT = 1.5  # of a member's distance to its third nearest: farther from all no row goes on, though lines lead there
+BESIDE = 0.5  # sine of the angle from the line to its nearest neighbour, from which on one stands beside a member
+NEXT = 1.3  # breadths: farther from all members no row goes on, though lines lead there
 DARKER = 0.15  # of its neighbours' light: a gloss adds some, so that such a dot's surroundings are hardly darker
 DIM, DIMMEST = 0.3, 0.15  # of the usual contrast; between them a dot must keep back as large a share of the light
 BLACKEST = 1.25  # shade: a dot that seems to keep back more than all light is none
@@ -133,6 +134,30 @@ def lines_through(place: NDArray, members: NDArray, most: float = np.inf) -> int
     return int(in_line[0].sum() + in_line[1].sum() // 2)
 
 
+@njit(cache=True)
+def breadth_of(rest):  # type: ignore[no-untyped-def]
+    """How far apart the lines of markers (M, 2) are.
+
+    The usual distance to the nearest that is not in line with the nearest.
+    """
+    count = len(rest)
+    breadths = np.empty(count)
+    for k in range(count):
+        ways = rest - rest[k]
+        distance = np.hypot(ways[:, 0], ways[:, 1])
+        distance[k] = np.inf
+        nearest = np.argmin(distance)
+        along = ways[nearest] / max(distance[nearest], 1e-9)
+        breadths[k] = np.inf
+        for other in range(count):
+            sine = abs(along[0] * ways[other, 1] - along[1] * ways[other, 0]) / max(distance[other], 1e-9)
+            if other != k and sine > BESIDE:
+                breadths[k] = min(breadths[k], distance[other])
+        if breadths[k] == np.inf:
+            breadths[k] = distance[nearest]
+    return np.median(breadths)
+
+
 def find_family(image: NDArray) -> tuple[Family, Dots] | None:
     """The markers of a picture: the largest set of well-located dots alike in size and contrast."""
     best: tuple[float, Family, Dots, NDArray] | None = None
@@ -167,11 +192,11 @@ def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArra
     level = np.median(members.parameters[near, 9], axis=1)
     light = np.maximum(level, level + family.contrast)
     glossy = (unlike < STRANGE) & (level - more.parameters[:, 9] < DARKER * light)
-    step = float(np.median(cKDTree(members.centre).query(members.centre, nearest[:4])[0][:, -1]))
+    next_to = NEXT * breadth_of(members.centre)
     kin, before = unlike < UNLIKE, -1
     while kin.sum() > before:  # each that is found lengthens lines
         before = int(kin.sum())
         known = np.concatenate([members.centre, more.centre[kin]])
         lines = np.array([lines_through(place, known) for place in more.centre], int)
-        kin |= (lines >= LINES) & (cKDTree(known).query(more.centre)[0] < NEXT * step) & glossy
+        kin |= (lines >= LINES) & (cKDTree(known).query(more.centre)[0] < next_to) & glossy
     return apart(first[good].beside(members[~good]).beside(more[kin]), SAME_PLACE * family.radius)

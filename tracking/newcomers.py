@@ -10,15 +10,14 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
 from tracking.candidate import Candidate, Look
 from tracking.cut import doubted
 from tracking.disc import PARAMETERS
-from tracking.dots import SAME_PLACE, Dots, apart, find_spots, fit_dots, start_of
-from tracking.family import DIM, IN_LINE, LINES, Family, lines_through
+from tracking.dots import SAME_PLACE, Dots, apart, find_spots, fit_dots, starts_at
+from tracking.family import DIM, IN_LINE, LINES, NEXT, Family, breadth_of, lines_through
 from tracking.memory import Belief, Memory
 from tracking.shape import NEIGHBOURS, Pattern
 
@@ -30,16 +29,14 @@ EVERY, SOON, SELDOM = 3, 2, 12
 KEPT, MOST_BYTES, CALMLY = 60, 2**28, 2
 FREE = 0.55  # spacings: how far on the body from known markers there may be another
 FAR = 2.4  # breadths: how far from them at most
-BESIDE = 0.5  # sine of the angle from the line to its nearest neighbour, from which on one stands beside a marker
 NEAR = 0.45  # spacings: how far from a candidate the same dot may seem to be at the next look
-UNRIVALLED = 2.0  # times as far: likewise, where no other dot or candidate is nearer than twice the gap
+UNRIVALLED = 2.0  # times as far: likewise, where every other dot and candidate is as many times as far as that
 SAME = 0.3  # spacings: how far from where it is expected a dot that is followed back may be
 FARTHER, BLUR = 2.0, 0.5  # times as far as between its looks, and px: likewise before its first look
 LOST = 2  # pictures before its first look without it, one after the other: there it was not in sight yet
 FOUND, LEAST_SEEN = 0.8, 3  # of the pictures since its first look, and how many at least: those that must show it
 FEWEST = 3  # markers of the body that tell where on it a dot belongs
 PINNED = 0.15  # spacings: how far a dot that keeps its place in the picture may seem to move on the body
-NEXT = 1.3  # breadths: how far such a dot may be from known markers
 JUMP = 0.5  # spacings: how far beside the body's motion no dot goes from picture to picture
 HOPPING, RESTING = 0.02, 0.1  # of how far a dot goes in all, and of the body's steps: its steps if it only hops
 ALIKE = 1.2  # ratio of radii within a family
@@ -110,7 +107,7 @@ class Newcomers:
             self._recent.popleft()
         if number < self._due or 2 * now.body.sum() < (~marks).sum():
             return []
-        spacing, breadth = float(np.median(pattern.spacing)), _breadth(pattern.rest[now.body])
+        spacing, breadth = float(np.median(pattern.spacing)), breadth_of(pattern.rest[now.body])
         found = self._strangers(image, place, FAR * breadth, 0.5 * FREE * spacing, parameters)
         if not len(found) and not self._candidates:
             self._due = number + EVERY
@@ -167,7 +164,7 @@ class Newcomers:
             now: the picture.
             rest: where the dots would be in the pattern [px], (D, 2).
             found: the dots [px], (D, 2).
-            most: how far one may seem to be from where it was before [px].
+            most: how far one may seem to be from where it was before [px], if it has a rival.
         """
         before = self._candidates
         gaps = np.array([[item.gap(*dot) for item in before] for dot in zip(rest, found, strict=True)])
@@ -183,7 +180,7 @@ class Newcomers:
         if not candidate.still(PINNED * spacing) or candidate.settled() or self._first is None:
             return False
         own, beside = np.median(candidate.rest, axis=0), IN_LINE * spacing
-        if np.linalg.norm(rest - own, axis=1).min() > NEXT * _breadth(rest):
+        if np.linalg.norm(rest - own, axis=1).min() > NEXT * breadth_of(rest):
             return False
         least = min(lines_through(place, np.delete(rest, k, axis=0), beside) for k, place in enumerate(rest))
         if lines_through(own, rest, beside) < np.clip(least, 1, LINES):
@@ -268,9 +265,10 @@ class Newcomers:
 
 
 def _matches(gaps: Array, row: int, column: int, most: float) -> bool:
-    """Whether of the gaps between dots and candidates (D, C) this is none: a small one, or the only one near."""
-    rivals = np.append(np.delete(gaps[row], column), np.delete(gaps[:, column], row))
-    return bool(gaps[row, column] < min(max(most, 0.5 * rivals.min(initial=np.inf)), UNRIVALLED * most))
+    """Whether of the gaps between dots and candidates (D, C) this is small enough, if need be for want of a rival."""
+    gap, others = gaps[row, column], np.append(np.delete(gaps[row], column), np.delete(gaps[:, column], row))
+    alone = UNRIVALLED * gap < others.min(initial=np.inf)
+    return bool(gap < (UNRIVALLED * most if alone else most))
 
 
 def _carried(memory: Memory, then: _Earlier, count: int) -> Array:
@@ -297,35 +295,10 @@ def _bent(rest: Array, place: Array) -> float:
     return float(np.sqrt((np.abs(left) ** 2).mean()))
 
 
-@njit(cache=True)
-def _breadth(rest):  # type: ignore[no-untyped-def]
-    """How far apart the lines of markers (M, 2) are.
-
-    The usual distance to the nearest that is not in line with the nearest.
-    """
-    count = len(rest)
-    breadths = np.empty(count)
-    for k in range(count):
-        ways = rest - rest[k]
-        distance = np.hypot(ways[:, 0], ways[:, 1])
-        distance[k] = np.inf
-        nearest = np.argmin(distance)
-        along = ways[nearest] / max(distance[nearest], 1e-9)
-        breadths[k] = np.inf
-        for other in range(count):
-            sine = abs(along[0] * ways[other, 1] - along[1] * ways[other, 0]) / max(distance[other], 1e-9)
-            if other != k and sine > BESIDE:
-                breadths[k] = min(breadths[k], distance[other])
-        if breadths[k] == np.inf:
-            breadths[k] = distance[nearest]
-    return np.median(breadths)
-
-
 def _starts(places: Array, parameters: Array) -> Array:
     """Of fits (D, 12) at places (D, 2): discs as the known markers' are."""
     usual = np.nanmedian(parameters, axis=0)
-    starts = [start_of(x, y, usual[2:5], usual[8], usual[9]) for x, y in places]
-    return np.array(starts).reshape(-1, PARAMETERS)
+    return starts_at(places, usual[2:5], usual[8], usual[9])
 
 
 def _moved(parameters: Array, place: Array) -> Array:

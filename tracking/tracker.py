@@ -13,8 +13,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from tracking.cut import WholeLooks
-from tracking.disc import PARAMETERS
-from tracking.dots import SAME_PLACE, SHADES, Dots, apart, find_spots, fit_dots, shade_of, start_of
+from tracking.dots import SAME_PLACE, SHADES, Dots, apart, find_spots, fit_dots, shade_of, starts_at
 from tracking.family import Family
 from tracking.marks import Marks
 from tracking.memory import Belief, Memory
@@ -168,39 +167,38 @@ class Tracker:
     def _where_expected(self, image: NDArray, expected: Array) -> Dots | None:
         """The dots at the markers' expected places; None where they are not all their own."""
         start = self.parameters.copy()
-        if self.misled.any():
-            start[self.misled] = start_of(0.0, 0.0, *self._usual_look())
         start[:, :2] = expected
+        if self.misled.any():
+            start[self.misled] = self._as_usual(expected[self.misled])
         dots = fit_dots(image, start)
+        if self.pictures < self.since[-1] + YOUNG:
+            dots = self._without_their_last_looks(image, dots, start)
         good = self.family.admits(dots)
-        if self.pictures < self.since[-1] + YOUNG and not (good & (dots.misfit < ODD)).all():
-            dots = self._without_their_last_looks(image, dots, good, start)
-            good = self.family.admits(dots)
         same = SAME_PLACE * self.family.radius
         calm = _own(dots.parameters, self.parameters, expected, self._seen(), self.pattern.spacing, same, good)
         return _only(dots, good) if calm else None
 
-    def _without_their_last_looks(self, image: NDArray, dots: Dots, good: NDArray[np.bool_], start: Array) -> Dots:
+    def _without_their_last_looks(self, image: NDArray, dots: Dots, start: Array) -> Dots:
         """The dots, odd ones as fits from the usual look find them, where these leave less; which is how they stay.
 
         A dot's own last look may take the edge of its sticker, or a strip of gloss, for its blur; now and then to start
         from it would make it jump.
         """
         young = self.pictures < self.since + YOUNG
-        odd = np.flatnonzero(self._seen() & young & ~self.misled & ~(good & (dots.misfit < ODD)))
+        good = self.family.admits(dots) & (dots.misfit < ODD)
+        odd = np.flatnonzero(self._seen() & young & ~self.misled & ~good)
         if not len(odd):
             return dots
-        anew = start[odd]
-        anew[:] = start_of(0.0, 0.0, *self._usual_look())
-        anew[:, :2] = start[odd, :2]
-        found = fit_dots(image, np.concatenate([anew, np.delete(start, odd, axis=0)]), len(odd))
+        anew = np.concatenate([self._as_usual(start[odd, :2]), np.delete(start, odd, axis=0)])
+        found = fit_dots(image, anew, len(odd))
         better = self.family.admits(found) & ~(found.misfit > dots.misfit[odd])
         self.misled[odd[better]] = True
         return _replaced(dots, odd[better], found[better])
 
-    def _usual_look(self) -> tuple[Array, float, float]:
-        """The markers' usual shape, contrast and level."""
-        return np.median(self.parameters[:, 2:5], axis=0), self.family.contrast, float(np.median(self.parameters[:, 9]))
+    def _as_usual(self, places: Array) -> Array:
+        """Starts of fits (D, 12) at places (D, 2): discs of the markers' usual shape, contrast and level."""
+        shape, level = np.median(self.parameters[:, 2:5], axis=0), float(np.median(self.parameters[:, 9]))
+        return starts_at(places, shape, self.family.contrast, level)
 
     def _search(self, image: NDArray, expected: Array) -> tuple[Dots, NDArray[np.bool_]]:
         """Every dot near the body, matched to the markers all at once, and which can be no other marker's."""
@@ -209,12 +207,10 @@ class Tracker:
         margin = (SEED_REACH + 1.0) * float(np.median(self.pattern.spacing)) + 2.0 * self.family.radius
         margin *= uncertain
         low, high = expected.min(0) - margin, expected.max(0) + margin
-        look = self._usual_look()
         region = int(low[0]), int(low[1]), int(high[0]), int(high[1])
         least = self.family.least(float(np.nanmin(np.abs(self.parameters[:, 8]))))
         spots = find_spots(image, self.family.radius, least, region)
-        starts = [start_of(x, y, *look) for x, y in spots]
-        dots = fit_dots(image, np.array(starts).reshape(-1, PARAMETERS))
+        dots = fit_dots(image, self._as_usual(spots))
         dots = apart(dots[self.family.admits(dots)], SAME_PLACE * self.family.radius)
         speed = np.linalg.norm(expected - self.motion.last, axis=1) / self.pattern.spacing
         trusted = -speed - 0.2 * np.minimum(self.missing, 10)

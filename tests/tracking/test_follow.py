@@ -240,7 +240,7 @@ def test_a_tip_hidden_at_first_is_put_where_it_was(speed: float) -> None:
 
 @pytest.mark.parametrize("speed", [0.6, 0.65, 0.7])
 def test_a_fast_tip_hidden_at_first_is_known_again_from_look_to_look(speed: float) -> None:
-    """It goes three spacings a frame, and seems to be anywhere on the body within one."""
+    """It goes nearly three spacings a frame, and seems to be anywhere on the body within one."""
     truth = np.array([curled(0.2 * np.cos(speed * frame)) for frame in range(90)]) + np.array([60.0, 118.0])
     places = truth.copy()
     places[:20, 8:] = np.nan
