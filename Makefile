@@ -17,7 +17,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 # A compiled kernel that is kept does not know that one which it calls has changed in another file.
-$(VENV)/kernels: $(VENV)/installed $(wildcard capture/*.py calibration/*.py rafl/*.py tracking/*.py)
+$(VENV)/kernels: $(VENV)/installed $(shell find calibration capture rafl tracking -name "*.py")
 	find capture calibration rafl tracking -name '*.nb[ci]' -delete
 	touch $@
 

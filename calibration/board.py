@@ -8,10 +8,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, field_validator, model_validator
+from rafl.calibration.fields import Direction
 from scipy.spatial import cKDTree
 
-from calibration.fields import Direction
-from groundwork import InputError, StrictModel, read_yaml
+from rafl.common.errors import InputError
+from rafl.common.yaml_files import StrictModel, read_yaml
 
 Array = NDArray[Any]
 

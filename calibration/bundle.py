@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rafl.calibration.camera import centre_and_half_diagonal
 from scipy.spatial.transform import Rotation
-
-from calibration.camera import centre_and_half_diagonal
 
 Array = NDArray[Any]
 

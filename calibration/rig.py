@@ -7,10 +7,11 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import yaml
 from pydantic import Field, field_validator
+from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane
+from rafl.calibration.fields import Direction, PositivePair
 
-from calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane
-from calibration.fields import Direction, PositivePair
-from groundwork import StrictModel, read_yaml, write_text
+from rafl.common.files import write_text
+from rafl.common.yaml_files import StrictModel, read_yaml
 
 FORMAT = "rafl-calibration/1"
 PLANE_SIGMA_MM = 0.5

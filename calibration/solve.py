@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rafl.calibration.board import BoardFile, View
+from rafl.calibration.bundle import NEARNESS, Adjusted, Scene, adjust
+from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane, centre_and_half_diagonal
+from rafl.calibration.initial_guess import Problem, rotation_starts, scene_of, start_from
+from rafl.calibration.rig import PLANE_SIGMA_MM, Rig
+from rafl.calibration.views import check_views, farther_edge
 from scipy.spatial.transform import Rotation
 
-from calibration.board import BoardFile, View
-from calibration.bundle import NEARNESS, Adjusted, Scene, adjust
-from calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane, centre_and_half_diagonal
-from calibration.rig import PLANE_SIGMA_MM, Rig
-from calibration.starts import Problem, rotation_starts, scene_of, start_from
-from calibration.views import check_views, farther_edge
-from groundwork import InputError
+from rafl.common.errors import InputError
 
 Array = NDArray[Any]
 

@@ -1,13 +1,12 @@
 """What a calibration found, in tables and sentences."""
 
 import numpy as np
+from rafl.calibration.board import View
+from rafl.calibration.camera import OrthographicCamera, PinholeCamera
+from rafl.calibration.rig import Rig
+from rafl.calibration.solve import PERSPECTIVE, Solution
+from rafl.calibration.validation import CheckedView
 from rich.table import Table
-
-from calibration.board import View
-from calibration.camera import OrthographicCamera, PinholeCamera
-from calibration.check import CheckedView
-from calibration.rig import Rig
-from calibration.solve import PERSPECTIVE, Solution
 
 HARMLESS_BIAS = 20e-6  # m: what a lens's perspective may cost before it is worth a warning
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rafl.calibration.board import View
 
-from calibration.board import View
-from groundwork import InputError
+from rafl.common.errors import InputError
 
 Array = NDArray[Any]
 

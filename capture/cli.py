@@ -9,20 +9,21 @@ from typing import Annotated
 import numpy as np
 import torch
 import typer
+from rafl.capture.dataset.build import CaptureSettings, build_dataset
+from rafl.capture.dataset.summary import print_page, recordings_table, warnings
+from rafl.capture.dataset.table import read_recording_rows
+from rafl.capture.registration.registration import RestPose
+from rafl.capture.rendering.film import ENCODINGS, film, side_cameras, write_board_images, write_truth
+from rafl.capture.rendering.motion import Motion, tip_load_release, twist_release
+from rafl.capture.rendering.render import Look, Painter
+from rafl.capture.report import write_dataset_report
+from rafl.capture.specimen.specimen import read_specimen
 from rich.console import Console
 
-from capture.build import CaptureSettings, build_dataset
-from capture.film import ENCODINGS, film, side_cameras, write_board_images, write_truth
-from capture.motion import Motion, tip_load_release, twist_release
-from capture.page import print_page, recordings_table, warnings
-from capture.registration import RestPose
-from capture.render import Look, Painter
-from capture.report import write_dataset_report
-from capture.specimen import read_specimen
-from capture.table import read_recording_rows
-from groundwork import InputError, command_line, progress, user_command, write_text
-from rafl.dataset_file import damaged_parts, update_dataset, write_dataset
-from rafl.errors import SimulationError
+from rafl.common.command_line import command_line, progress, user_command
+from rafl.common.errors import InputError, SimulationError
+from rafl.common.files import write_text
+from rafl.data.dataset_file import damaged_parts, update_dataset, write_dataset
 
 DRAWN_MM = 2.0  # how far off the skin a marker may stand to be drawn there
 

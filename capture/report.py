@@ -5,12 +5,12 @@ from pathlib import Path
 import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
+from rafl.capture.dataset.summary import warnings
+from rafl.capture.specimen.specimen import Specimen
 
-from capture.page import warnings
-from capture.specimen import Specimen
-from groundwork import write_text
-from rafl.dataset import Dataset
-from rafl.pictures import bodies
+from rafl.common.files import write_text
+from rafl.data.dataset import Dataset
+from rafl.evaluation.figures import bodies
 
 MOST_PICTURES = 9  # first frames shown
 A_ROW = 3

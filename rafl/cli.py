@@ -10,11 +10,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from groundwork import InputError, command_line, progress, user_command, write_text
-from rafl.dataset import Dataset
-from rafl.dataset_file import read_dataset
-from rafl.errors import SimulationError
-from rafl.evaluation import (
+from rafl.common.command_line import command_line, progress, user_command
+from rafl.common.errors import InputError, SimulationError
+from rafl.common.files import write_text
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import read_dataset
+from rafl.evaluation.metrics import (
     Comparison,
     Transfer,
     compare_those_that_simulate,
@@ -24,13 +25,13 @@ from rafl.evaluation import (
     motion_table,
     split_table,
 )
-from rafl.fit import nothing_to_follow
-from rafl.methods import EPOCHS, METHODS, check_inputs
-from rafl.processes import process_count, rank
-from rafl.report import write_report
-from rafl.run import FittedModel, Settings, load_model, read_settings, write_settings
-from rafl.sysid import spoken
-from rafl.warm_start import LARGEST
+from rafl.evaluation.report import write_report
+from rafl.fitting.distributed import process_count, rank
+from rafl.fitting.methods import EPOCHS, METHODS, check_inputs
+from rafl.fitting.run_folder import FittedModel, Settings, load_model, read_settings, write_settings
+from rafl.fitting.sysid import spoken
+from rafl.fitting.train_field import nothing_to_follow
+from rafl.fitting.warm_start import LARGEST
 
 # The network is small; the other core serves the element kernels.
 TORCH_THREADS = 1

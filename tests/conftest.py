@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rafl.capture.specimen.specimen import Specimen, read_specimen
 from support import Run, enter_command
-
-from capture.specimen import Specimen, read_specimen
 
 
 def _forget_stale_kernels() -> None:
@@ -29,7 +28,7 @@ _forget_stale_kernels()
 
 # Imports what commands need once; each of them is a fork of that.
 COMMANDS = multiprocessing.get_context("forkserver")
-COMMANDS.set_forkserver_preload(["support", "capture.cli", "rafl.cli", "tracking.cli"])
+COMMANDS.set_forkserver_preload(["support", "rafl.capture.cli", "rafl.cli", "rafl.tracking.cli"])
 
 SMALL = """format: rafl-specimen/1
 name: small

@@ -9,21 +9,21 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from rafl.calibration.camera import OrthographicCamera, Plane
+from rafl.calibration.rig import Rig, write_rig
+from rafl.capture.dataset.build import CaptureSettings, build_dataset
+from rafl.capture.dataset.table import RecordingRow
+from rafl.capture.rendering.motion import tip_load_release
+from rafl.capture.specimen.specimen import Specimen
 from support import Run, assert_refused, picture
 
-from calibration.camera import OrthographicCamera, Plane
-from calibration.rig import Rig, write_rig
-from capture.build import CaptureSettings, build_dataset
-from capture.motion import tip_load_release
-from capture.specimen import Specimen
-from capture.table import RecordingRow
-from rafl.dataset import Dataset
-from rafl.dataset_file import write_dataset
-from rafl.global_residual import GlobalResidual
-from rafl.mesh import HexMesh
-from rafl.residual import ResidualField
-from rafl.run import FittedModel, save_model
-from rafl.synthetic import released
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import write_dataset
+from rafl.data.synthetic import released
+from rafl.fem.mesh import HexMesh
+from rafl.fitting.run_folder import FittedModel, save_model
+from rafl.residual.acceleration_field import ResidualField
+from rafl.residual.global_residual import GlobalResidual
 
 COMMANDS = ("rafl-render", "rafl-calibrate", "rafl-track", "rafl-capture", "rafl-fit", "rafl-eval")
 

@@ -14,12 +14,11 @@ import av
 import numpy as np
 import pytest
 import yaml
+from rafl.calibration.camera import OrthographicCamera, Plane
+from rafl.calibration.rig import Rig, write_rig
+from rafl.tracking.cli import track_app
 from support import picture
 from typer.testing import CliRunner
-
-from calibration.camera import OrthographicCamera, Plane
-from calibration.rig import Rig, write_rig
-from tracking.cli import track_app
 
 SIZE = (200, 160)
 
@@ -100,7 +99,7 @@ def test_who_is_stopped_gives_up_what_runs_and_what_waits(lab: Path, monkeypatch
             tick()
             time.sleep(0.01)
 
-    monkeypatch.setattr("tracking.cli.track_recording", endless)
+    monkeypatch.setattr("rafl.tracking.cli.track_recording", endless)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs in a shell's background ignores it
     try:
         result = CliRunner().invoke(track_app, command(lab))

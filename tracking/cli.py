@@ -13,28 +13,29 @@ from typing import Annotated
 import cv2
 import numpy as np
 import typer
+from rafl.calibration.board import View, read_board
+from rafl.calibration.board_images import board_views, check_placed
+from rafl.calibration.camera import Camera
+from rafl.calibration.rig import Rig, read_rig, write_rig
+from rafl.calibration.solve import solve_rig
+from rafl.calibration.summary import camera_table, check_table, lens_lines
+from rafl.calibration.validation import check_view, write_picture
+from rafl.tracking.linking.layout import read_layout
+from rafl.tracking.overlay import write_overlay
+from rafl.tracking.pipeline import TrackingSettings, finished, track_recording
+from rafl.tracking.reconstruction.export import WRITERS, export_name
+from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
+from rafl.tracking.report import summary_cells, write_report
+from rafl.tracking.rest import FACES, camera_at_rest, rest_videos
+from rafl.tracking.video.reader import Video
+from rafl.tracking.video.recordings import find_recordings
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 from threadpoolctl import threadpool_limits
 
-from calibration.board import View, read_board
-from calibration.camera import Camera
-from calibration.check import check_view, write_picture
-from calibration.pictures import board_views, check_placed
-from calibration.rig import Rig, read_rig, write_rig
-from calibration.solve import solve_rig
-from calibration.summary import camera_table, check_table, lens_lines
-from groundwork import InputError, command_line, progress, user_command
-from tracking.export import WRITERS, export_name
-from tracking.layout import read_layout
-from tracking.overlay import write_overlay
-from tracking.pipeline import TrackingSettings, finished, track_recording
-from tracking.recordings import find_recordings
-from tracking.report import summary_cells, write_report
-from tracking.rest import FACES, camera_at_rest, rest_videos
-from tracking.tracks import Tracks, write_tracks
-from tracking.video import Video
+from rafl.common.command_line import command_line, progress, user_command
+from rafl.common.errors import InputError
 
 MODELS = ("orthographic", "pinhole")
 HEEDING = 1.0  # s after which whoever waits looks whether it was told to stop: not every signal wakes it

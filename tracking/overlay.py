@@ -9,13 +9,13 @@ import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from rafl.calibration.camera import Camera
+from rafl.tracking.detection.detect import eight_bits
+from rafl.tracking.reconstruction.gap_filling import FILLED
+from rafl.tracking.reconstruction.tracks import Tracks
+from rafl.tracking.video.reader import Video
 
-from calibration.camera import Camera
-from groundwork import whole_file
-from tracking.dots import eight_bits
-from tracking.fill import FILLED
-from tracking.tracks import Tracks
-from tracking.video import Video
+from rafl.common.files import whole_file
 
 Array = NDArray[Any]
 

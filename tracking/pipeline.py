@@ -8,17 +8,19 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rafl.calibration.rig import Rig, rig_text
+from rafl.tracking.linking.follow import FEWEST_MARKERS, PixelTracks, follow
+from rafl.tracking.linking.layout import MarkerLayout
+from rafl.tracking.linking.naming import name_by_layout, name_by_rows
+from rafl.tracking.reconstruction.gap_filling import MEASURED, fill_gaps
+from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels, at_times, shown_frames, triangulate
+from rafl.tracking.video.reader import Video
+from rafl.tracking.video.timestamps import camera_times, common_clock, delays
 
-from calibration.rig import Rig, rig_text
-from groundwork import VERSION, InputError, sha256
-from tracking.clock import camera_times, common_clock, delays
-from tracking.fill import MEASURED, fill_gaps
-from tracking.follow import FEWEST_MARKERS, PixelTracks, follow
-from tracking.layout import MarkerLayout
-from tracking.naming import name_by_layout, name_by_rows
-from tracking.reconstruct import CameraPixels, at_times, shown_frames, triangulate
-from tracking.tracks import Tracks, read_tracks
-from tracking.video import Video
+from rafl.common.errors import InputError
+from rafl.common.files import sha256
+from rafl.common.version import VERSION
 
 Array = NDArray[Any]
 

@@ -11,12 +11,12 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from rafl.calibration.rig import Rig
+from rafl.tracking.overlay import annotate, shown_pixels
+from rafl.tracking.reconstruction.gap_filling import FILLED, MEASURED, MISSING
+from rafl.tracking.reconstruction.tracks import Tracks
 
-from calibration.rig import Rig
-from groundwork import write_text
-from tracking.fill import FILLED, MEASURED, MISSING
-from tracking.overlay import annotate, shown_pixels
-from tracking.tracks import Tracks
+from rafl.common.files import write_text
 
 WIDEST = 900
 STATE_COLOURS = ["#c0392b", "#4c9f70", "#e6a23c"]  # missing, measured, filled

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rafl.calibration.camera import OrthographicCamera
+from rafl.calibration.rest_pose import FEWEST_POINTS, RestCamera, camera_from_points
+from rafl.tracking.linking.follow import follow
+from rafl.tracking.linking.layout import MarkerLayout
+from rafl.tracking.linking.naming import name_by_layout, visible_markers
+from rafl.tracking.video.reader import Video, is_video, natural_key, open_video
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from calibration.camera import OrthographicCamera
-from calibration.rest import FEWEST_POINTS, RestCamera, camera_from_points
-from groundwork import InputError
-from tracking.follow import follow
-from tracking.layout import MarkerLayout
-from tracking.naming import name_by_layout, visible_markers
-from tracking.video import Video, is_video, natural_key, open_video
+from rafl.common.errors import InputError
 
 Array = NDArray[Any]
 
@@ -70,7 +70,7 @@ def camera_at_rest(
         video: its.
         layout: of the specimen's markers.
         face: one of `FACES`; None to try them all.
-        tilt_sign: see `calibration.rest.camera_from_points`.
+        tilt_sign: see `rafl.calibration.rest_pose.camera_from_points`.
         tick: called after every frame.
 
     Raises:

@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from rafl.capture.registration.initial import FirstFrame, fit_first_frame
+from rafl.capture.registration.sequence import ITERATIONS, fit_by_sequence
+from rafl.capture.specimen.specimen import read_specimen
 from rich.console import Console
 from rich.table import Table
 
-from capture.initial import FirstFrame, fit_first_frame
-from capture.sequence import ITERATIONS, fit_by_sequence
-from capture.specimen import read_specimen
-from rafl.synthetic import hung
+from rafl.data.synthetic import hung
 
 CANONICAL = Path(__file__).parents[2] / "datasets" / "specimens" / "canonical.yaml"
 SIGMA = 5e-6

@@ -12,12 +12,11 @@ import pandas as pd
 import trackpy
 from footage import Row, write_video
 from motions import Beam, random_beam
-
-from tracking.artificial import Scene, draw, expose
-from tracking.fill import fill_gaps
-from tracking.follow import follow
-from tracking.frame import Frame
-from tracking.video import Reading, Video, open_video
+from rafl.tracking.linking.follow import follow
+from rafl.tracking.reconstruction.gap_filling import fill_gaps
+from rafl.tracking.synthetic import Scene, draw, expose
+from rafl.tracking.video.frame import Frame
+from rafl.tracking.video.reader import Reading, Video, open_video
 
 
 @dataclass(frozen=True)

@@ -8,17 +8,17 @@ from pathlib import Path
 import ezc3d
 import numpy as np
 from footage import Row, write_video
+from rafl.calibration.board import BoardFile, View, WorldPose
+from rafl.calibration.camera import Camera, OrthographicCamera
+from rafl.calibration.rig import Rig
+from rafl.calibration.solve import solve_rig
+from rafl.tracking.linking.layout import MarkerLayout
+from rafl.tracking.pipeline import TrackingSettings, track_recording
+from rafl.tracking.synthetic import Scene, draw, expose
+from rafl.tracking.video.reader import Video, open_video
 from scipy.spatial.transform import Rotation
 
-from calibration.board import BoardFile, View, WorldPose
-from calibration.camera import Camera, OrthographicCamera
-from calibration.rig import Rig
-from calibration.solve import solve_rig
-from groundwork import InputError
-from tracking.artificial import Scene, draw, expose
-from tracking.layout import MarkerLayout
-from tracking.pipeline import TrackingSettings, track_recording
-from tracking.video import Video, open_video
+from rafl.common.errors import InputError
 
 SIZE = (1280, 720)
 BOARD = 0.01 * np.stack(np.meshgrid(np.arange(10), np.arange(6)), axis=-1).reshape(-1, 2)

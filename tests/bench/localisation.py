@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 import trackpy
 from footage import Row, write_video
+from rafl.tracking.detection.appearance import find_family
+from rafl.tracking.detection.detect import Dots
+from rafl.tracking.linking.follow import follow
+from rafl.tracking.synthetic import Scene, draw, expose
+from rafl.tracking.video.reader import open_video
 from scipy.optimize import linear_sum_assignment
-
-from tracking.artificial import Scene, draw, expose
-from tracking.dots import Dots
-from tracking.family import find_family
-from tracking.follow import follow
-from tracking.video import open_video
 
 
 @dataclass(frozen=True)

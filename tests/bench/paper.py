@@ -19,24 +19,24 @@ import numpy as np
 import pandas as pd
 import torch
 import yaml
+from rafl.capture.specimen.specimen import read_specimen
 from rich.console import Console
 from rich.table import Table
 
-from capture.specimen import read_specimen
-from groundwork import write_text
-from rafl.dataset import Dataset
-from rafl.dataset_file import read_dataset, write_dataset
-from rafl.evaluation import compare_those_that_simulate, split_table
-from rafl.fit import Item, batches, mean_error, shortened
-from rafl.material import Material
-from rafl.mesh import HexMesh
-from rafl.methods import METHODS
-from rafl.objective import Recordings
-from rafl.residual import ResidualField
-from rafl.run import FittedModel, Settings, load_model, load_tensors, write_settings
-from rafl.simulator import Simulator
-from rafl.synthetic import hung, released, twisted, with_material
-from rafl.targets import PENALTY, residual_targets
+from rafl.common.files import write_text
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import read_dataset, write_dataset
+from rafl.data.objective import Recordings
+from rafl.data.synthetic import hung, released, twisted, with_material
+from rafl.evaluation.metrics import compare_those_that_simulate, split_table
+from rafl.fem.material import Material
+from rafl.fem.mesh import HexMesh
+from rafl.fitting.methods import METHODS
+from rafl.fitting.residual_targets import PENALTY, residual_targets
+from rafl.fitting.run_folder import FittedModel, Settings, load_model, load_tensors, write_settings
+from rafl.fitting.train_field import Item, batches, mean_error, shortened
+from rafl.residual.acceleration_field import ResidualField
+from rafl.simulation.simulator import Simulator
 
 EXPERIMENTS = Path(__file__).parents[2] / "datasets" / "experiments"
 SPECIMENS = EXPERIMENTS.parent / "specimens"

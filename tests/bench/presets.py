@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import torch
+from rafl.capture.dataset.build import CaptureSettings, build_dataset
+from rafl.capture.dataset.table import read_recording_rows
+from rafl.capture.specimen.specimen import read_specimen
 from scipy.optimize import curve_fit
 
-from capture.build import CaptureSettings, build_dataset
-from capture.specimen import read_specimen
-from capture.table import read_recording_rows
-from rafl.dataset import Dataset
-from rafl.material import Material
-from rafl.objective import Recordings, frame_errors
-from rafl.rollout import equilibrium
-from rafl.run import Settings
-from rafl.sysid import identify_material
+from rafl.data.dataset import Dataset
+from rafl.data.objective import Recordings, frame_errors
+from rafl.fem.material import Material
+from rafl.fitting.run_folder import Settings
+from rafl.fitting.sysid import identify_material
+from rafl.simulation.rollout import equilibrium
 
 SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
 REST = ("beam_gravity_V2_b", 65)  # the beam is held straight there

@@ -17,21 +17,22 @@ import pandas as pd
 import torch
 import yaml
 from commands import command
+from rafl.capture.rendering.film import film, side_cameras, write_board_images
+from rafl.capture.rendering.motion import Motion
+from rafl.capture.rendering.render import Look, Painter
+from rafl.capture.specimen.specimen import Specimen, read_specimen
 from rich.console import Console
 from rich.table import Table
 
-from capture.film import film, side_cameras, write_board_images
-from capture.motion import Motion
-from capture.render import Look, Painter
-from capture.specimen import Specimen, read_specimen
-from groundwork import progress, write_text
-from rafl.dataset import Dataset
-from rafl.dataset_file import read_dataset
-from rafl.evaluation import ORIGINAL, compare_those_that_simulate, latex_table, split_table
-from rafl.material import Material
-from rafl.mesh import HexMesh
-from rafl.run import FittedModel, load_model
-from rafl.synthetic import hung, let_go
+from rafl.common.command_line import progress
+from rafl.common.files import write_text
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import read_dataset
+from rafl.data.synthetic import hung, let_go
+from rafl.evaluation.metrics import ORIGINAL, compare_those_that_simulate, latex_table, split_table
+from rafl.fem.material import Material
+from rafl.fem.mesh import HexMesh
+from rafl.fitting.run_folder import FittedModel, load_model
 
 DATASETS = Path(__file__).parents[2] / "datasets"
 FPS = 100.0

@@ -20,10 +20,10 @@ from scipy.linalg import cholesky_banded
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
-from rafl.material import Material
-from rafl.mesh import HexMesh
-from rafl.rollout import Start, rollout
-from rafl.simulator import Simulator
+from rafl.fem.material import Material
+from rafl.fem.mesh import HexMesh
+from rafl.simulation.rollout import Start, rollout
+from rafl.simulation.simulator import Simulator
 
 ORIGINAL, TARGET = Material(215856.0, 0.45), Material(263824.0, 0.499)
 # The paper's own simulator on this kind of machine, 2 threads: forward and backward step [ms].

@@ -21,12 +21,11 @@ from following import filling, hiding, linking, speed
 from footage import Row
 from geometry import calibrating, reconstructing
 from localisation import localisation
+from rafl.tracking.cli import SOON
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from threadpoolctl import threadpool_limits
-
-from tracking.cli import SOON
 
 warnings.filterwarnings("ignore")
 logging.getLogger("trackpy").setLevel(logging.ERROR)

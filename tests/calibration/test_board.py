@@ -2,8 +2,7 @@ import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
-
-from calibration.board import BoardFile, CharucoPattern
+from rafl.calibration.board import BoardFile, CharucoPattern
 
 PATTERN = CharucoPattern(kind="charuco", squares=(8, 5), square_mm=10, marker_mm=7.5)
 PRINT = 40  # print pixels per square; the picture shows it at 1.5 times that

@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 import pytest
 import yaml
+from rafl.calibration.rig import read_rig
 from scipy.spatial.transform import Rotation
 from support import Run, assert_refused
-
-from calibration.rig import read_rig
 
 SCALE = 9.0  # px/mm
 

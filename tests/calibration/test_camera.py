@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
-from calibration.camera import OrthographicCamera
+from rafl.calibration.camera import OrthographicCamera
 
 FRONT = OrthographicCamera(
     image_size=(1280, 720), scale=(10_000.0, 9_900.0), skew=50.0, rotation_vector=(0.0, 0.0, 0.0), offset=(600.0, 300.0)

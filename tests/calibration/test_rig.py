@@ -1,10 +1,10 @@
 from pathlib import Path
 
 import pytest
+from rafl.calibration.camera import OrthographicCamera, Plane
+from rafl.calibration.rig import Rig, read_rig, write_rig
 
-from calibration.camera import OrthographicCamera, Plane
-from calibration.rig import Rig, read_rig, write_rig
-from groundwork import InputError
+from rafl.common.errors import InputError
 
 CAMERA = OrthographicCamera(
     image_size=(640, 480), scale=(9000.0, 9010.0), skew=3.0, rotation_vector=(0.1, 1.5, -0.2), offset=(12.0, 34.0),

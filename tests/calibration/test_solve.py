@@ -2,12 +2,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from rafl.calibration.board import BoardFile, Move, View, WorldPose
+from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera
+from rafl.calibration.solve import Solution, solve_rig
 from scipy.spatial.transform import Rotation
 
-from calibration.board import BoardFile, Move, View, WorldPose
-from calibration.camera import Camera, OrthographicCamera, PinholeCamera
-from calibration.solve import Solution, solve_rig
-from groundwork import InputError
+from rafl.common.errors import InputError
 
 SIZE = (1280, 720)
 PLAIN = BoardFile.model_validate(

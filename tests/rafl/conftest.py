@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 import torch
+from rafl.capture.specimen.specimen import Specimen
 
-from capture.specimen import Specimen
-from rafl.dataset import Dataset, Trajectory
-from rafl.material import Material
-from rafl.synthetic import hung, let_go
+from rafl.data.dataset import Dataset, Trajectory
+from rafl.data.synthetic import hung, let_go
+from rafl.fem.material import Material
 
 TRUE = Material(190e3, 0.45, mass="lumped", law="corotated")
 LOADS = {"a": 0.04, "b": 0.10, "c": 0.07, "d": 0.08}

@@ -6,7 +6,7 @@ import pandas as pd
 import pytest
 from support import ROOT, SHARED, Run
 
-from rafl.dataset_file import read_dataset
+from rafl.data.dataset_file import read_dataset
 
 FOLDER = SHARED / "real" / "clamped_beam"
 SPECIMENS = ROOT / "datasets" / "specimens"

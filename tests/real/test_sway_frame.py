@@ -8,11 +8,10 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from rafl.tracking.linking.follow import follow
+from rafl.tracking.video.frame import Frame
+from rafl.tracking.video.reader import Reading, open_video
 from support import SHARED, Run, write_video
-
-from tracking.follow import follow
-from tracking.frame import Frame
-from tracking.video import Reading, open_video
 
 FOLDER = SHARED / "real" / "sway_frame"
 pytestmark = [

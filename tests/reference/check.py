@@ -15,13 +15,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rafl.errors import SimulationError
-from rafl.features import GaussPoints, features
-from rafl.material import Material, lame
-from rafl.mesh import HexMesh
-from rafl.residual import ResidualField
-from rafl.rollout import Start, rollout
-from rafl.simulator import Simulator
+from rafl.common.errors import SimulationError
+from rafl.fem.material import Material, lame
+from rafl.fem.mesh import HexMesh
+from rafl.residual.acceleration_field import ResidualField
+from rafl.residual.features import GaussPoints, features
+from rafl.simulation.rollout import Start, rollout
+from rafl.simulation.simulator import Simulator
 
 TRAJECTORY_LIMIT = 1e-9  # m
 GRADIENT_LIMIT = 1e-6  # of the largest component

@@ -5,17 +5,17 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
+from rafl.calibration.camera import OrthographicCamera
+from rafl.calibration.rest_pose import camera_from_points
+from rafl.calibration.rig import read_rig
+from rafl.tracking.cli import calibrate_app
+from rafl.tracking.linking.layout import read_layout
+from rafl.tracking.synthetic import Scene, draw, expose
 from scipy.spatial.transform import Rotation
 from support import ROOT, Run, assert_refused
 from typer.testing import CliRunner
 
-from calibration.camera import OrthographicCamera
-from calibration.rest import camera_from_points
-from calibration.rig import read_rig
-from groundwork import InputError
-from tracking.artificial import Scene, draw, expose
-from tracking.cli import calibrate_app
-from tracking.layout import read_layout
+from rafl.common.errors import InputError
 
 SPECIMEN = ROOT / "datasets/specimens/canonical.yaml"
 LAYOUT = read_layout(SPECIMEN)

@@ -1,0 +1,1 @@
+"""Datasets built from tracks and a table of recordings."""

@@ -1,0 +1,82 @@
+"""What a dataset file holds, on a page of text."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import read_dataset
+
+
+def recordings_table(dataset: Dataset) -> Table:
+    """A row a recording: split, load, where it begins, and how well markers and first frame fit."""
+    table = Table(
+        "recording", "split", "load [g]", "frames", "seen", "begins at", "registration [mm]", "first frame [mm]"
+    )
+    for name, item in dataset.trajectories.items():
+        values = item.attributes
+        still = int(str(values.get("still_frames", 0)))
+        begins = f"{values.get('first_frame', '-')}" + (f" (mean of {still} before)" if still else "")
+        table.add_row(
+            name, item.split, f"{_number(values.get('load_g'), 'g')} {values.get('load', '')}", str(len(item.time)),
+            f"{item.valid.mean():.1%}", begins, _number(values.get("registration_residual_mm"), ".3f"),
+            _number(values.get("fit_residual_mm"), ".3f"),
+        )  # fmt: skip
+    return table
+
+
+def _number(value: object, form: str) -> str:
+    return format(value, form) if isinstance(value, (int, float)) else "-"
+
+
+def warnings(dataset: Dataset) -> list[str]:
+    """What somebody should look at: markers that were set aside."""
+    lines = []
+    for name, item in dataset.trajectories.items():
+        if wrong := item.attributes.get("set_aside"):
+            lines.append(
+                f"recording {name}: {wrong} did not stand where the specimen's layout has it and was set aside; "
+                "correct at_mm, or the names in the tracks"
+            )
+    return lines
+
+
+def print_page(path: Path, console: Console) -> None:
+    """Print specimen, recordings, residuals and provenance.
+
+    Raises:
+        InputError: no dataset, or a damaged one.
+    """
+    dataset = read_dataset(path)
+    simulator, mesh = dataset.simulator, dataset.simulator.mesh
+    with h5py.File(path, "r") as file:
+        created, software, units = (str(file.attrs[key]) for key in ("created", "software", "units"))
+    size = 1e3 * np.ptp(mesh.vertices, axis=0)
+    material = simulator.material
+    lines = {
+        "specimen": f"{dataset.name}: {len(mesh.vertices)} vertices, {len(mesh.hexes)} elements, "
+        f"{size[0]:.4g} x {size[1]:.4g} x {size[2]:.4g} mm, {1e6 * mesh.volumes.sum():.4g} ml; "
+        f"{len(simulator.fixed)} vertices held",
+        "material": f"{material.law}, E = {material.youngs_modulus:g} Pa, nu = {material.poissons_ratio:g}, "
+        f"{material.density:g} kg/m3, {material.mass} mass",
+        "time": f"{1 / simulator.time_step:g} frames/s, {simulator.integrator}, {simulator.substeps} substeps",
+        "markers": f"{len(dataset.markers.names)}: {', '.join(dataset.markers.names)}",
+        "splits": ", ".join(f"{split} {len(dataset.split(split))}" for split in ("train", "val", "test")),
+        "units": units,
+        "made": f"{created} by {software}",
+    }
+    for key, text in lines.items():
+        console.print(f"[bold]{key}[/bold]: {text}", highlight=False)
+    console.print(recordings_table(dataset))
+    for name, item in dataset.trajectories.items():
+        values = item.attributes
+        console.print(
+            f"{name}: registered by {values.get('registration', '-')} ({values.get('registration_markers') or '-'}); "
+            f"first frame from {values.get('first_frame_from', '-')}; source {values.get('source', '-')}",
+            highlight=False,
+        )
+    for line in warnings(dataset):
+        console.print(line, highlight=False)

@@ -1,0 +1,76 @@
+"""`recordings.csv`: which recordings a dataset is made of, and how."""
+
+import csv
+import io
+from collections import Counter
+from pathlib import Path
+from typing import Literal
+
+import pydantic
+
+from rafl.common.errors import InputError
+from rafl.common.files import require_file
+from rafl.common.yaml_files import StrictModel
+
+
+class RecordingRow(StrictModel):
+    """A row of recordings.csv.
+
+    `load` says whether the load was cut off at the start (`released`) or hangs on during the motion
+    (`hanging`); frames count from 0 and `last_frame` is included. Without `first_frame` the motion shows it.
+    """
+
+    recording: str = pydantic.Field(min_length=1)
+    load_g: float = pydantic.Field(ge=0)
+    split: Literal["train", "val", "test"]
+    load: Literal["released", "hanging"] = "released"
+    first_frame: int | None = pydantic.Field(None, ge=0)
+    last_frame: int | None = pydantic.Field(None, ge=1)
+
+
+def read_recording_rows(path: Path, complete: bool = True) -> list[RecordingRow]:
+    """Read recordings.csv; a `complete` one has recordings to train on.
+
+    Cells are separated by commas, semicolons or tabs, as spreadsheets of one country or another save them; where not
+    by commas, a number's comma is a decimal one.
+
+    Raises:
+        InputError: missing, no table, or a row that does not fit; names the line.
+    """
+    require_file(path, "a table of recordings (recordings.csv)")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+        separator = max(",;\t", key=text.partition("\n")[0].count)
+        table = csv.DictReader(io.StringIO(text), delimiter=separator, skipinitialspace=True)
+        records = [(table.line_num, record) for record in table]
+    except (csv.Error, UnicodeDecodeError) as error:
+        raise InputError(f"expected a table in {path}, found: {error}; save it as CSV UTF-8") from None
+    if not table.fieldnames:
+        raise InputError(f"expected a table in {path}, found an empty file; save it as CSV UTF-8")
+    rows = []
+    for line, record in records:
+        if any(record.pop(None, [])):
+            raise InputError(
+                f"{path} line {line}: expected {len(table.fieldnames)} cells as in the first line, found more; "
+                "put quotes around a cell that has a separator in it"
+            )
+        cells = {key.strip(): (value or "").strip() for key, value in record.items()}
+        given = {key: value for key, value in cells.items() if value}
+        if not given:  # an empty row of a spreadsheet
+            continue
+        if separator != "," and "load_g" in given:
+            given["load_g"] = given["load_g"].replace(",", ".")
+        try:
+            rows.append(RecordingRow.model_validate(given))
+        except pydantic.ValidationError as error:
+            first = error.errors()[0]
+            column = ".".join(map(str, first["loc"]))
+            raise InputError(f"{path} line {line}, column {column}: {first['msg']}; correct it") from None
+    if not rows:
+        raise InputError(f"expected at least one recording in {path}, found none; add a row")
+    twice = [name for name, count in Counter(row.recording for row in rows).items() if count > 1]
+    if twice:
+        raise InputError(f"{path}: expected each recording once, {twice[0]} stands there twice; remove one row")
+    if complete and not any(row.split == "train" for row in rows):
+        raise InputError(f"{path}: expected a recording with split `train`, found none; set one")
+    return rows

@@ -1,0 +1,1 @@
+"""Recordings placed on the specimen: rigid registration, release time, first frame."""

@@ -1,0 +1,1 @@
+"""The specimen: its description, shape, mesh and markers."""

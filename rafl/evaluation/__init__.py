@@ -1,0 +1,1 @@
+"""Fitted models judged on recordings: error tables, oscillation, reports."""

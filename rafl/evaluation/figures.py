@@ -1,0 +1,59 @@
+"""Pictures of simulated bodies for reports."""
+
+import base64
+import io
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from mpl_toolkits.mplot3d.art3d import Poly3DCollection
+from numpy.typing import NDArray
+
+from rafl.fem.mesh import HexMesh
+
+Array = NDArray[Any]
+
+
+def png(figure: Figure) -> str:
+    """The figure, closed, as base64 text."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=110)
+    plt.close(figure)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def _axes_3d(figure: Figure, place: int, count: int, q: Array, title: str) -> Any:
+    axes = figure.add_subplot(1, count, place, projection="3d")
+    low, high = 1e3 * q.min(0), 1e3 * q.max(0)
+    middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
+    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
+    axes.set(zlim=(middle[2] - half, middle[2] + half), xlabel="x [mm]", ylabel="y [mm]", zlabel="z [mm]", title=title)
+    axes.set_box_aspect((1, 1, 1), zoom=0.88)
+    axes.view_init(elev=18, azim=-62)
+    axes.tick_params(labelsize=7)
+    return axes
+
+
+def bodies(mesh: HexMesh, frames: list[tuple[str, Array, Array]]) -> str:
+    """Bodies in 3-D with recorded markers as dots; frames of title, positions (N, 3) and markers (M, 3) [m]."""
+    figure = plt.figure(figsize=(4.6 * len(frames), 4.2), layout="constrained")
+    every = np.concatenate([q for _, q, _ in frames])
+    for k, (title, q, markers) in enumerate(frames):
+        axes = _axes_3d(figure, k + 1, len(frames), every, title)
+        skin = Poly3DCollection(
+            1e3 * q[mesh.surface], facecolor="#9bc1e3", edgecolor="#3b6f9e", linewidth=0.4, alpha=0.35
+        )
+        axes.add_collection3d(skin)
+        axes.scatter(*(1e3 * markers[np.isfinite(markers[:, 0])].T), color="#c0392b", s=6, depthshade=False)
+    return png(figure)
+
+
+def forces(mesh: HexMesh, size: dict[str, Array]) -> str:
+    """Mean residual force at every vertex (N) [N], by method, as colour on the rest shape (the paper's figure)."""
+    figure = plt.figure(figsize=(5.2 * len(size), 4.2), layout="constrained")
+    for k, (method, values) in enumerate(size.items()):
+        axes = _axes_3d(figure, k + 1, len(size), mesh.vertices, method)
+        dots = axes.scatter(*(1e3 * mesh.vertices.T), c=1e3 * values, cmap="viridis", s=22, depthshade=False)
+        figure.colorbar(dots, ax=axes, shrink=0.6, label="mean residual force [mN]")
+    return png(figure)

@@ -1,0 +1,1 @@
+"""Residual forces: the acceleration field of the paper and the supervised network."""

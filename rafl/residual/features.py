@@ -1,0 +1,136 @@
+"""The 34 local features of the residual acceleration field (paper, table of input features)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numba import njit, prange
+from torch import Tensor
+
+from rafl.fem.mesh import HexMesh
+from rafl.fem.svd import signed_svd
+
+FEATURES = 34
+
+
+@njit(cache=True, parallel=True)
+def _batched_svd(F, U, s, V):  # type: ignore[no-untyped-def]
+    for index in prange(F.shape[0]):
+        signed_svd(F[index], U[index], s[index], V[index])
+
+
+class _PolarStretch(torch.autograd.Function):
+    """Rotation R (P, 3, 3) and ascending signed stretches (P, 3) of F (P, 3, 3).
+
+    The backward never divides by a difference of stretches, so repeated ones (and exact rest) are
+    harmless: dR = U [(M - M^T)_ij / (s_i + s_j)] V^T and ds_i = M_ii with M = U^T dF V.
+    """
+
+    @staticmethod
+    def forward(ctx, F: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        array = F.detach().numpy()
+        U, V = np.empty_like(array), np.empty_like(array)
+        s = np.empty(array.shape[:-1])
+        _batched_svd(np.ascontiguousarray(array), U, s, V)
+        left, stretch, right = (torch.from_numpy(part) for part in (U, s, V))
+        ctx.save_for_backward(left, stretch, right)
+        return left @ right.mT, stretch.flip(-1)
+
+    @staticmethod
+    def backward(ctx, by_R: Tensor, by_s: Tensor) -> Tensor:  # type: ignore[override]
+        U, s, V = ctx.saved_tensors
+        N = U.mT @ by_R @ V
+        total = s[:, :, None] + s[:, None, :]
+        total = torch.where(total.abs() < 1e-9, torch.full_like(total, 1e-9), total)
+        K = (N - N.mT) / total + torch.diag_embed(by_s.flip(-1))
+        return U @ K @ V.mT
+
+
+@dataclass(frozen=True)
+class GaussPoints:
+    """What features and forces need of a mesh, as tensors.
+
+    Attributes:
+        hexes: (E, 8).
+        shape: (8 points, 8 nodes).
+        gradient: [1/m], (E, 8 points, 8 nodes, 3).
+        mass: true mass of each point, rho V_e [kg], (E, 8).
+    """
+
+    hexes: Tensor
+    shape: Tensor
+    gradient: Tensor
+    mass: Tensor
+
+    @classmethod
+    def of(cls, mesh: HexMesh, density: float) -> "GaussPoints":
+        """The Gauss points of a mesh of density [kg/m^3]."""
+        rule = mesh.quadrature
+        return cls(
+            torch.from_numpy(mesh.hexes),
+            torch.from_numpy(rule.shape),
+            torch.from_numpy(rule.gradient),
+            torch.from_numpy(density * rule.volume),
+        )
+
+    def accumulate(self, acceleration: Tensor, nodes: int) -> Tensor:
+        """Nodal forces [N], (B, N, 3), of accelerations (B, E, 8, 3) [m/s^2] (paper, accumulation eq.)."""
+        share = torch.einsum("gn,begi->beni", self.shape, acceleration * self.mass[..., None])
+        force = share.new_zeros(len(share), nodes, 3)
+        return force.index_add(1, self.hexes.reshape(-1), share.reshape(len(share), -1, 3))
+
+
+def features(q: Tensor, v: Tensor, points: GaussPoints, gravity: Tensor) -> tuple[Tensor, Tensor]:
+    """The 34 features and the rotation at every Gauss point.
+
+    Args:
+        q, v: positions [m] and velocities [m/s], (B, N, 3).
+        points: of the mesh.
+        gravity: acceleration by external body forces [m/s^2], (3).
+
+    Returns:
+        Features (B, E, 8, 34), in order: principal stretches - 1 (ascending), flat(F^T F - I),
+        det F - 1, diag D, tr D, flat(dev D), sqrt(|dev D|^2 / 2), axial W, |2 axial W|, R^T g, where
+        D and W are co-rotated; and R (B, E, 8, 3, 3).
+    """
+    batch, cells = len(q), len(points.hexes)
+    at_nodes = torch.stack([q, v])[:, :, points.hexes]  # (2, B, E, 8, 3)
+    F, rate = torch.einsum("sbeni,egnj->sbegij", at_nodes, points.gradient).reshape(2, -1, 3, 3)
+    R, stretch = _PolarStretch.apply(F)
+    local = R.mT @ F  # right stretch tensor S; L co-rotated is R^T rate F^-1 R = R^T rate S^-1
+    a, b, c = local.unbind(-1)
+    cofactor = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-2)
+    determinant = (a * cofactor[:, 0]).sum(-1, keepdim=True)
+    L = R.mT @ rate @ (cofactor / determinant[..., None])
+    D = 0.5 * (L + L.mT)
+    W = 0.5 * (L - L.mT)
+    identity = torch.eye(3, dtype=q.dtype)
+    diagonal = D.diagonal(dim1=-2, dim2=-1)
+    trace = diagonal.sum(-1, keepdim=True)
+    shear = D - trace[..., None] / 3.0 * identity
+    axial = torch.stack([W[:, 2, 1], W[:, 0, 2], W[:, 1, 0]], dim=-1)
+    # A square root has no slope at zero: 1e-20 (1/s)^2 keeps both finite at exact rest.
+    shear_size = torch.sqrt(0.5 * (shear**2).sum((-2, -1)) + 1e-20)[:, None]
+    spin_size = torch.sqrt(4.0 * (axial**2).sum(-1) + 1e-30)[:, None]
+    parts = [
+        stretch - 1.0,
+        (F.mT @ F - identity).flatten(-2),
+        determinant - 1.0,
+        diagonal,
+        trace,
+        shear.flatten(-2),
+        shear_size,
+        axial,
+        spin_size,
+        (R.mT @ gravity[:, None])[..., 0],
+    ]
+    shape = (batch, cells, 8)
+    return torch.cat(parts, dim=-1).reshape(*shape, FEATURES), R.reshape(*shape, 3, 3)
+
+
+def mirrored_features(sign: Tensor) -> Tensor:
+    """The signs, (34), that the features take in a mirror where a vector's components take the signs `sign` (3)."""
+    one, even = sign.new_ones(1), sign.new_ones(3)
+    tensor = torch.outer(sign, sign).flatten()
+    axial = sign.prod() * sign
+    return torch.cat([even, tensor, one, even, one, tensor, one, axial, one, sign])

@@ -1,0 +1,1 @@
+"""Direct and iterative solvers of the simulator's linear systems."""

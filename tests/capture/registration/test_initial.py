@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+import torch
+from rafl.capture.registration.initial import FirstFrame, fit_first_frame
+from rafl.capture.registration.sequence import fit_by_sequence
+from rafl.capture.specimen.specimen import Specimen, read_specimen
+from support import ROOT
+
+from rafl.data.synthetic import hung, load_force, twisted
+
+CANONICAL = ROOT / "datasets" / "specimens" / "canonical.yaml"
+
+
+@pytest.mark.parametrize("force", [(0.0, 0.0, -0.4), (0.05, 0.1, 0.3)])
+def test_the_true_state_is_found_from_exact_markers(
+    small_specimen: Specimen, force: tuple[float, float, float]
+) -> None:
+    """Markers of a known equilibrium: they are met to 20 um and the whole mesh to 50 um."""
+    simulator = small_specimen.simulator(0.01)
+    markers = small_specimen.markers(1e-6)
+    loaded = np.zeros_like(simulator.mesh.vertices)
+    loaded[small_specimen.loaded] = np.array(force) / len(small_specimen.loaded)
+    truth = simulator.equilibrium((simulator.weight + loaded)[None])[0]
+    target = markers.positions(torch.from_numpy(truth)).numpy()
+    sigma = np.full_like(target, 1e-5)
+    found = fit_first_frame(FirstFrame(simulator, markers, small_specimen.loaded, target, sigma, "test"))
+    assert found.residual < 2e-5
+    assert np.linalg.norm(found.q - truth, axis=1).max() < 5e-5
+    np.testing.assert_allclose(found.force.sum(0), force, atol=0.01)
+
+
+def test_unseen_markers_and_unobserved_axes_do_not_count(small_specimen: Specimen) -> None:
+    """Depth 2 mm wrong with a sigma of 5 mm, and three markers missing: the shape is still found."""
+    simulator = small_specimen.simulator(0.01)
+    markers = small_specimen.markers(1e-6)
+    truth = hung(simulator, small_specimen.loaded, np.array([0.05]))[0]
+    target = markers.positions(torch.from_numpy(truth)).numpy()
+    target[:, 1] += 2e-3
+    sigma = np.full_like(target, 1e-5)
+    sigma[:, 1] = 5e-3
+    target[[0, 7, 13]] = np.nan
+    found = fit_first_frame(FirstFrame(simulator, markers, small_specimen.loaded, target, sigma, "test"))
+    assert np.linalg.norm(found.q - truth, axis=1).max() < 2e-4
+    assert found.residual < 5e-5
+
+
+@pytest.mark.parametrize("local", [0.0, 0.03])
+def test_noise_of_five_micrometres(local: float) -> None:
+    """The canonical beam under a weight, and pulled at every node besides: markers within 1.5 sigma; under the weight
+    alone every vertex within 0.05 mm."""
+    specimen = read_specimen(CANONICAL)
+    simulator, markers, random = specimen.simulator(0.01), specimen.markers(1e-6), np.random.default_rng(6)
+    force = simulator.weight + load_force(simulator, specimen.loaded, 0.12)
+    force[specimen.loaded] += random.normal(0, local, (len(specimen.loaded), 3))
+    truth = simulator.equilibrium(force[None])[0]
+    target = markers.positions(torch.from_numpy(truth)).numpy()
+    sigma = np.full_like(target, 5e-6)
+    noisy = target + random.normal(0, 1, target.shape) * sigma
+    found = fit_first_frame(FirstFrame(simulator, markers, specimen.loaded, noisy, sigma, "test"))
+    assert found.residual / np.sqrt(3.0) < 1.5 * 5e-6
+    assert np.linalg.norm(found.q - truth, axis=1).max() < (5e-5 if local == 0.0 else 5e-4)
+
+
+def test_forces_all_over_the_surface_reach_what_the_tip_cannot() -> None:
+    """A twist held by hand along the whole canonical beam."""
+    specimen = read_specimen(CANONICAL)
+    simulator, markers = specimen.simulator(0.01), specimen.markers(1e-6)
+    truth = twisted(simulator.mesh, np.array([1.0]))[0]
+    target = markers.positions(torch.from_numpy(truth)).numpy()
+    sigma = np.full_like(target, 2e-5)
+    surface = np.setdiff1d(np.unique(simulator.mesh.surface), simulator.fixed)
+    tip = fit_first_frame(FirstFrame(simulator, markers, specimen.loaded, target, sigma, "test"))
+    all_over = fit_first_frame(FirstFrame(simulator, markers, surface, target, sigma, "test", everywhere=True))
+    near, far = (np.linalg.norm(found.q - truth, axis=1).max() for found in (all_over, tip))
+    assert near < 1.5e-3
+    assert near < 0.6 * far
+    assert all_over.residual < 0.5 * tip.residual
+
+
+def test_the_slow_way_finds_the_same_shape(small_specimen: Specimen) -> None:
+    """Few of Adam's iterations come near; a sequence of forces needs hundreds to come as near as the direct fit."""
+    simulator, markers = small_specimen.simulator(0.01), small_specimen.markers(1e-6)
+    truth = hung(simulator, small_specimen.loaded, np.array([0.05]))[0]
+    target = markers.positions(torch.from_numpy(truth)).numpy()
+    frame = FirstFrame(simulator, markers, small_specimen.loaded, target, np.full_like(target, 1e-5), "test")
+    few = fit_by_sequence(frame, 12)
+    rest = simulator.equilibrium(simulator.weight[None])[0]
+    off = np.linalg.norm(few.q - truth, axis=1).max()
+    assert off < 0.5 * np.linalg.norm(rest - truth, axis=1).max()
+    assert np.linalg.norm(fit_first_frame(frame).q - truth, axis=1).max() < 0.1 * off

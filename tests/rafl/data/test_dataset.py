@@ -1,0 +1,206 @@
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from rafl.common.errors import InputError
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
+
+
+def test_round_trip(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    material = replace(dataset.simulator.material, viscosity=12.0, integration="selective")
+    simulator = replace(dataset.simulator, material=material, integrator="generalised-alpha", substeps=3)
+    dataset = replace(dataset, simulator=simulator)
+    write_dataset(path, dataset)
+    back = read_dataset(path)
+    assert (back.simulator.integrator, back.simulator.substeps) == ("generalised-alpha", 3)
+    assert back.name == dataset.name
+    assert back.simulator.material == dataset.simulator.material
+    assert back.simulator.gravity == dataset.simulator.gravity
+    assert back.markers.names == dataset.markers.names
+    np.testing.assert_array_equal(back.simulator.mesh.hexes, dataset.simulator.mesh.hexes)
+    np.testing.assert_array_equal(back.markers.weights, dataset.markers.weights)
+    for name, item in dataset.trajectories.items():
+        other = back.trajectories[name]
+        for key in ("time", "markers", "valid", "sigma", "q", "v", "virtual_force", "load", "added_mass"):
+            np.testing.assert_array_equal(getattr(other, key), getattr(item, key))
+        assert other.split == item.split
+        assert other.attributes == item.attributes
+    assert back.split("train") == ["a", "b"]
+
+
+def test_a_newer_version_is_refused_by_name(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    with h5py.File(path, "r+") as file:
+        file.attrs["format"] = "rafl-dataset/9"
+    with pytest.raises(InputError, match="rafl-dataset/9, newer"):
+        read_dataset(path)
+
+
+def test_damage_is_noticed(dataset: Dataset, tmp_path: Path) -> None:
+    """A flipped byte in the markers fails its checksum; a cut file does not open."""
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    content = path.read_bytes()
+    needle = dataset.trajectories["b"].markers.tobytes()[:64]
+    place = content.index(needle) + 8
+    path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_dataset(path)
+    path.write_bytes(content[: len(content) // 2])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_dataset(path)
+
+
+def test_an_empty_dataset_is_refused(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    write_dataset(path, Dataset(dataset.name, dataset.simulator, dataset.markers, {}))
+    with pytest.raises(InputError, match="at least one trajectory"):
+        read_dataset(path)
+
+
+def content(path: Path, name: str) -> dict[str, bytes]:
+    """Everything in a recording of a file."""
+    found = {}
+    with h5py.File(path) as file:
+        group = file[f"trajectories/{name}"]
+        group.visititems(lambda key, item: found.update({key: item[()].tobytes()} if hasattr(item, "dtype") else {}))
+        found.update({f"attribute {key}": np.asarray(value).tobytes() for key, value in group.attrs.items()})
+    return found
+
+
+def test_one_recording_is_replaced_or_added_and_the_others_stay(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    before = {name: content(path, name) for name in dataset.trajectories}
+    changed = replace(dataset.trajectories["b"], split="test")
+    update_dataset(path, replace(dataset, trajectories={"b": changed, "e": dataset.trajectories["a"]}, recipe="more"))
+    assert sorted(read_dataset(path).trajectories) == ["a", "b", "c", "d", "e"]
+    for name in ("a", "c", "d"):
+        assert content(path, name) == before[name]
+    assert read_dataset(path).trajectories["b"].split == "test"
+    assert read_dataset(path).recipe == "by a test\n# then\nmore"
+    assert damaged_parts(path) == []
+    other = replace(dataset, simulator=replace(dataset.simulator, mesh=dataset.simulator.mesh.scaled((1.1, 1, 1))))
+    twice = replace(dataset, simulator=replace(dataset.simulator, substeps=2))
+    for wrong, message in ((other, "another mesh"), (at_step(dataset, 0.0102), "frames/s"), (twice, "substeps 1")):
+        with pytest.raises(InputError, match=message):
+            update_dataset(path, wrong)
+    assert content(path, "a") == before["a"]
+    with pytest.raises(InputError, match=r"none\.h5"):
+        update_dataset(tmp_path / "none.h5", dataset)
+
+
+def at_step(dataset: Dataset, step: float) -> Dataset:
+    return replace(dataset, simulator=replace(dataset.simulator, time_step=step))
+
+
+def test_recordings_of_nearly_the_same_rate_are_added(dataset: Dataset, tmp_path: Path) -> None:
+    """The file's own time step stays."""
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    update_dataset(path, replace(at_step(dataset, 0.01002), trajectories={"e": dataset.trajectories["a"]}))
+    assert read_dataset(path).simulator.time_step == dataset.simulator.time_step
+    assert "e" in read_dataset(path).trajectories
+
+
+def test_changed_numbers_and_words_are_found(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    assert damaged_parts(path) == []
+    with h5py.File(path, "r+") as file:
+        file["trajectories/b/initial/q"][3, 1] += 1e-9
+        file["trajectories/c"].attrs["load_g"] = 71.0
+        file["material"].attrs["poissons_ratio"] = 0.44
+        file.attrs["time_step"] = 0.02
+    assert damaged_parts(path) == ["/", "material", "trajectories/b", "trajectories/c"]
+    with h5py.File(path, "r+") as file:
+        del file["mesh"].attrs["sha256"]
+    with pytest.raises(InputError, match="found none for mesh"):
+        damaged_parts(path)
+
+
+def test_every_array_says_its_unit_and_frame(dataset: Dataset, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "a.h5", dataset)
+    missing = []
+
+    def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        if (
+            isinstance(item, h5py.Dataset)
+            and name != "markers/names"
+            and not (item.attrs["unit"] and item.attrs["frame"])
+        ):
+            missing.append(name)
+
+    with h5py.File(tmp_path / "a.h5") as file:
+        file.visititems(look)
+        assert file["trajectories/a/initial/v"].attrs["unit"] == "m/s"
+    assert missing == []
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("time", np.arange(25) ** 1.1 * 0.01, "time: expected two or more even times"),
+        ("sigma", np.zeros((25, 20, 3)), "sigma: expected more than 0"),
+        ("markers", np.full((25, 20, 3), np.nan), "markers: expected finite positions"),
+        ("q", np.zeros((3, 3)), r"q: expected shape \(63, 3\)"),
+        ("v", np.full((63, 3), np.inf), "v: expected finite"),
+        ("split", "training", "split: expected train, val, test"),
+    ],
+)
+def test_parts_that_do_not_fit_are_neither_written_nor_read(
+    dataset: Dataset, tmp_path: Path, key: str, value: object, message: str
+) -> None:
+    path = tmp_path / "a.h5"
+    bad = replace(dataset, trajectories={"a": replace(dataset.trajectories["a"], **{key: value})})  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=message):
+        write_dataset(path, bad)
+    assert not path.exists()
+    write_dataset(path, dataset)
+    with h5py.File(path, "r+") as file:
+        where = "trajectories/a/initial" if key in ("q", "v") else "trajectories/a"
+        if key == "split":
+            file[where].attrs[key] = value
+        else:
+            del file[where][key]
+            file[where][key] = value
+    with pytest.raises(InputError, match=message):
+        read_dataset(path)
+
+
+KILLING = """
+import os, random, signal, sys, time
+from dataclasses import replace
+from pathlib import Path
+from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset
+path, random = Path(sys.argv[1]), random.Random(8)
+dataset = read_dataset(path)
+for _ in range(50):
+    writer = os.fork()
+    while not writer:
+        update_dataset(path, dataset)
+    time.sleep(random.uniform(0.005, 0.1))
+    os.kill(writer, signal.SIGKILL)
+    os.waitpid(writer, 0)
+    print(damaged_parts(path))
+"""
+
+
+def test_fifty_kills_leave_a_whole_file(dataset: Dataset, tmp_path: Path) -> None:
+    """A program that writes the file over and over is killed at any time; the file is whole every time."""
+    path = tmp_path / "a.h5"
+    big = {f"r{k}": dataset.trajectories["a"] for k in range(8)}
+    write_dataset(path, replace(dataset, trajectories=big))
+    said = subprocess.run([sys.executable, "-c", KILLING, str(path)], capture_output=True, text=True, check=True)
+    assert said.stdout.splitlines() == ["[]"] * 50
+    assert sorted(read_dataset(path).trajectories) == sorted(big)
+    write_dataset(path, dataset)
+    assert [item.name for item in tmp_path.iterdir()] == ["a.h5"]  # what was half written is gone

@@ -1,0 +1,208 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from rafl.fem.material import Material
+from rafl.fem.mesh import HexMesh
+from rafl.residual.acceleration_field import ResidualField
+from rafl.residual.features import GaussPoints, _PolarStretch, features
+from rafl.simulation.simulator import Simulator
+
+G = torch.tensor([0.0, 0.0, -9.8], dtype=torch.float64)
+
+
+@pytest.fixture(scope="module")
+def mesh() -> HexMesh:
+    return HexMesh.box((2, 2, 1), (0.04, 0.02, 0.02))
+
+
+@pytest.fixture(scope="module")
+def field(mesh: HexMesh) -> tuple[ResidualField, Simulator]:
+    torch.manual_seed(3)
+    return ResidualField(), Simulator(mesh, Material(), mesh.face_nodes("x-min"))
+
+
+@pytest.mark.parametrize(
+    "F",
+    [np.eye(3), np.diag([1.2, 1.2, 0.9]), np.diag([1.3, 0.9, 0.2])],
+    ids=["rest", "repeated", "thin"],
+)
+def test_polar_backward_by_finite_differences(F: np.ndarray, random: np.random.Generator) -> None:
+    """R, and the sum of squares of the stretches, which is smooth where they cross."""
+    at = torch.tensor(Rotation.from_rotvec([0.3, 0.2, -0.5]).as_matrix() @ F)[None].requires_grad_()
+    weights = torch.tensor(random.normal(size=(3, 3)))
+
+    def value(F: torch.Tensor) -> torch.Tensor:
+        R, s = _PolarStretch.apply(F)
+        return (R * weights).sum() + (s**2).sum()
+
+    assert torch.autograd.gradcheck(value, (at,), eps=1e-6, atol=1e-6)
+
+
+def test_features_and_gradients_are_finite_at_exact_rest(mesh: HexMesh) -> None:
+    q = torch.tensor(mesh.vertices[None]).requires_grad_()
+    v = torch.zeros_like(q).requires_grad_()
+    values, _ = features(q, v, GaussPoints.of(mesh, 1070.0), G)
+    values.square().sum().backward()
+    assert torch.isfinite(values).all()
+    assert torch.isfinite(q.grad).all()
+    assert torch.isfinite(v.grad).all()
+    assert values[..., :31].abs().max() < 1e-9
+
+
+def test_features_of_a_known_motion(mesh: HexMesh) -> None:
+    """q = A x with A = R diag(1.1, 0.9, 1), v = B q: F = A, L = B everywhere."""
+    R = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
+    A = R @ np.diag([1.1, 0.9, 1.0])
+    B = np.array([[0.1, 0.4, 0.0], [-0.2, 0.3, 0.5], [0.1, 0.0, -0.6]])
+    q = mesh.vertices @ A.T
+    values, rotation = features(torch.tensor(q[None]), torch.tensor((q @ B.T)[None]), GaussPoints.of(mesh, 1070.0), G)
+    np.testing.assert_allclose(rotation[0, 0, 0].numpy(), R, atol=1e-13)
+    one = values[0, 1, 5].numpy()
+    local = R.T @ B @ R
+    D, W = 0.5 * (local + local.T), 0.5 * (local - local.T)
+    dev = D - np.trace(D) / 3 * np.eye(3)
+    axial = np.array([W[2, 1], W[0, 2], W[1, 0]])
+    expected = np.concatenate(
+        [
+            [-0.1, 0.0, 0.1], (A.T @ A - np.eye(3)).ravel(), [0.99 - 1.0], np.diag(D), [np.trace(D)],
+            dev.ravel(), [np.sqrt(0.5 * (dev**2).sum())], axial, [2 * np.linalg.norm(axial)],
+            R.T @ G.numpy(),
+        ]
+    )  # fmt: skip
+    np.testing.assert_allclose(one, expected, atol=1e-12)
+
+
+def test_force_turns_with_the_body(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
+    model, simulator = field
+    turn = torch.tensor(Rotation.from_rotvec([0.2, 1.0, -0.4]).as_matrix())
+    q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
+    v = torch.tensor(random.normal(0, 0.2, q.shape))
+    gx, gy, gz = (turn @ torch.tensor(simulator.gravity, dtype=torch.float64)).tolist()
+    turned = Simulator(simulator.mesh, simulator.material, simulator.fixed, gravity=(gx, gy, gz))
+    force = model.on(simulator)(q, v, 0 * q)
+    torch.testing.assert_close(model.on(turned)(q @ turn.T, v @ turn.T, 0 * q), force @ turn.T, atol=1e-12, rtol=1e-9)
+
+
+@pytest.mark.parametrize("mirrors", [[False, True, False], [False, True, True], [True, True, True]])
+def test_mirrored_motion_meets_the_mirrored_force(
+    mesh: HexMesh, mirrors: list[bool], random: np.random.Generator
+) -> None:
+    """Across every axis that the field is mirrored in, gravity included; not across the others."""
+    torch.manual_seed(3)
+    model = ResidualField()
+    model.mirror(torch.tensor(mirrors))
+    q = mesh.vertices + random.normal(0, 1e-3, mesh.vertices.shape)
+    v = random.normal(0, 0.2, q.shape)
+    gravity = np.array([1.0, 3.0, -9.0])
+
+    def force(q: np.ndarray, v: np.ndarray, gravity: np.ndarray) -> np.ndarray:
+        simulator = Simulator(mesh, Material(), mesh.face_nodes("x-min"), gravity=tuple(gravity.tolist()))
+        with torch.no_grad():
+            states = (torch.tensor(x[None]) for x in (q, v, 0.0 * v))
+            return model.on(simulator)(*states)[0].numpy()
+
+    for axis, mirrored in enumerate(mirrors):
+        sign = 1.0 - 2.0 * np.eye(3)[axis]
+        width = np.ptp(mesh.vertices[:, axis])
+        there = (mesh.vertices - width * np.eye(3)[axis]) * sign
+        image = np.linalg.norm(mesh.vertices[:, None] - there[None], axis=-1).argmin(axis=1)
+        found = force((q[image] * sign) + width * np.eye(3)[axis], v[image] * sign, gravity * sign)
+        expected = force(q, v, gravity)[image] * sign
+        assert np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max()) == mirrored
+
+
+def test_units_that_cannot_change_places_are_refused() -> None:
+    with pytest.raises(ValueError, match="multiple of 8, got 20"):
+        ResidualField(width=20)
+
+
+def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
+    model, simulator = field
+    q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
+    v = torch.tensor(random.normal(0, 0.2, q.shape))
+    force = model.on(simulator)
+    c, dq, dv = (torch.tensor(random.normal(size=q.shape)) for _ in range(3))
+    q.requires_grad_()
+    v.requires_grad_()
+    (force(q, v, 0 * q) * c).sum().backward()
+    h = 1e-6
+    with torch.no_grad():
+        slope = ((force(q + h * dq, v + h * dv, q) - force(q - h * dq, v - h * dv, q)) * c).sum() / (2 * h)
+    assert q.grad is not None
+    assert v.grad is not None
+    assert float((q.grad * dq + v.grad * dv).sum()) == pytest.approx(float(slope), rel=1e-5)
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+@pytest.mark.parametrize("still", [True, False])
+def test_compiled_field_is_the_plain_one(still: bool, mirrored: bool, random: np.random.Generator) -> None:
+    """Forces and every derivative of several bent states, at rest too, on cells of different shapes."""
+    torch.manual_seed(1)
+    model = ResidualField()
+    model.scale.copy_(torch.linspace(0.5, 20.0, 34))
+    model.mirror(torch.tensor([False, mirrored, mirrored]))
+    cells = np.ones((3, 2, 2), dtype=bool)
+    cells[2, 1] = False
+    mesh = HexMesh.from_grid(cells, (0.01, 0.012, 0.008))
+    simulator = Simulator(mesh, Material(), mesh.face_nodes("x-min"))
+    moves = 0.0 if still else random.normal(0, 2e-3, (3, *mesh.vertices.shape))
+    q = torch.tensor(mesh.vertices + moves + np.zeros((3, 1, 1)))
+    v = torch.tensor(random.normal(0, 0.3, q.shape) * (not still))
+    c = torch.tensor(random.normal(size=q.shape))
+    results = []
+    for force in (model.on(simulator), model.plainly_on(simulator)):
+        leaves = [q.clone().requires_grad_(), v.clone().requires_grad_()]
+        value = force(*leaves, 0 * q)
+        results.append([value, *torch.autograd.grad((value * c).sum(), [*leaves, *model.parameters()])])
+    for number, (compiled, plain) in enumerate(zip(*results, strict=True)):
+        assert torch.isfinite(compiled).all()
+        if still and number == 1:
+            continue  # where all stretches are equal, which of them is the smallest has no derivative
+        torch.testing.assert_close(compiled, plain, rtol=1e-8, atol=1e-11 * float(plain.detach().abs().max()))
+
+
+def test_weights_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
+    model, simulator = field
+    q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
+    v = torch.tensor(random.normal(0, 0.2, q.shape))
+    c = torch.tensor(random.normal(size=q.shape))
+    model.zero_grad()
+    (model.on(simulator)(q, v, 0 * q) * c).sum().backward()
+    for weight in model.parameters():
+        direction = torch.tensor(random.normal(size=weight.shape))
+        assert weight.grad is not None
+        gradient = float((weight.grad * direction).sum())
+        with torch.no_grad():
+            values = []
+            for sign in (1, -1):
+                weight += sign * 1e-6 * direction
+                values.append(float((model.on(simulator)(q, v, 0 * q) * c).sum()))
+                weight -= sign * 1e-6 * direction
+        assert gradient == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-5)
+
+
+def test_a_uniform_acceleration_weighs_the_body(mesh: HexMesh) -> None:
+    """Accumulating the same acceleration everywhere gives total force = mass * acceleration."""
+    points = GaussPoints.of(mesh, 1000.0)
+    acceleration = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).expand(1, len(mesh.hexes), 8, 3)
+    force = points.accumulate(acceleration, len(mesh.vertices))
+    np.testing.assert_allclose(force[0].sum(0).numpy(), 0.016 * np.array([1.0, 2.0, 3.0]))
+
+
+def test_scaled_features_have_no_units_and_no_giants(random: np.random.Generator) -> None:
+    """Rates in other units are the same inputs, and a feature that training hardly excites is not the loudest."""
+    model, size = ResidualField(), torch.tensor(random.uniform(0.5, 2.0, 34))
+    size[[5, 20]] = torch.tensor([1e-9, 0.0], dtype=torch.float64)
+    model.scale_to(size)
+    inputs = model.scale * size
+    other = size.clone()
+    other[13:31] *= 1000.0
+    model.scale_to(other)
+    assert torch.allclose(model.scale * other, inputs)
+    assert model.scale[:13].max() < 50.0 * model.scale[:13].min()
+    without_gravity = size.clone()
+    without_gravity[31:] = 0.0
+    model.scale_to(without_gravity)
+    assert torch.isfinite(model.scale).all()

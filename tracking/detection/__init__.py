@@ -1,0 +1,1 @@
+"""Dots found in a frame and fitted as soft-edged ellipses."""

@@ -1,0 +1,1 @@
+"""Markers followed from frame to frame: prediction, assignment, late-detected markers, names."""

@@ -1,0 +1,64 @@
+"""Where the markers sit on the undeformed specimen."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+from rafl.common.yaml_files import StrictModel, read_yaml
+
+SPECIMEN_FORMAT = "rafl-specimen/1"
+
+
+class MarkerEntry(StrictModel):
+    """One marker of a specimen."""
+
+    name: str = Field(min_length=1)
+    at_mm: tuple[float, float, float]
+
+
+def _different_names(markers: list[MarkerEntry]) -> list[MarkerEntry]:
+    names = [marker.name for marker in markers]
+    twice = {name for name in names if names.count(name) > 1}
+    if twice:
+        raise ValueError(f"expected different names, {sorted(twice)[0]} occurs twice")
+    return markers
+
+
+MarkerList = Annotated[list[MarkerEntry], AfterValidator(_different_names)]
+
+
+class MarkerEntries(BaseModel):
+    """The part of a specimen file that tracking reads; the rest is for others."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+    format: str
+    markers: Annotated[MarkerList, Field(min_length=1)]
+
+
+@dataclass(frozen=True)
+class MarkerLayout:
+    """Names (M) and rest positions (M, 3) in the specimen frame [m]."""
+
+    names: tuple[str, ...]
+    positions: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, markers: list[MarkerEntry]) -> "MarkerLayout":
+        """From a specimen file's entries."""
+        positions = 1e-3 * np.array([marker.at_mm for marker in markers], dtype=float).reshape(-1, 3)
+        return cls(tuple(marker.name for marker in markers), positions)
+
+
+def read_layout(path: Path) -> MarkerLayout:
+    """Read the markers of a specimen file.
+
+    Raises:
+        InputError: missing, damaged, or of a newer version.
+    """
+    content = read_yaml(path, MarkerEntries, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
+    return MarkerLayout.of(content.markers)
