@@ -189,9 +189,15 @@ def capture(
     described = read_specimen(specimen)
     rows = read_recording_rows(recordings, complete=not update)
     settings = CaptureSettings(
-        1e-3 * tolerance_mm, 1e-3 * fit_tolerance_mm, fps, _rest_pose(rest), moving_clamp, start,
-        initial.value, forces.value,
-    )  # fmt: skip
+        1e-3 * tolerance_mm,
+        1e-3 * fit_tolerance_mm,
+        fps,
+        _rest_pose(rest),
+        moving_clamp,
+        start,
+        initial.value,
+        forces.value,
+    )
     path = out or Path("datasets") / f"{described.name}.h5"
     recipe = f"{described.text}\n# recordings.csv\n{recordings.read_text(encoding='utf-8')}"
     with progress() as bar:

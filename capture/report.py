@@ -81,10 +81,18 @@ def write_dataset_report(path: Path, specimen: Specimen, dataset: Dataset) -> No
 def _row(name: str, dataset: Dataset) -> list[object]:
     item, values = dataset.trajectories[name], dataset.trajectories[name].attributes
     return [
-        name, item.split, f"{values['load_g']:g} {values['load']}", len(item.time), f"{item.valid.mean():.1%}",
-        values["first_frame"], values["first_frame_from"], values["still_frames"], values["registration"],
-        f"{values['registration_residual_mm']:.3f}", f"{values['fit_residual_mm']:.3f}",
-    ]  # fmt: skip
+        name,
+        item.split,
+        f"{values['load_g']:g} {values['load']}",
+        len(item.time),
+        f"{item.valid.mean():.1%}",
+        values["first_frame"],
+        values["first_frame_from"],
+        values["still_frames"],
+        values["registration"],
+        f"{values['registration_residual_mm']:.3f}",
+        f"{values['fit_residual_mm']:.3f}",
+    ]
 
 
 def _registration(name: str, values: dict[str, object]) -> str:

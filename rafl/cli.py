@@ -100,10 +100,21 @@ def fit(
     check_inputs(method, loaded, start, integrator)
     epochs = epochs or EPOCHS[method]
     settings = Settings(
-        method, tuple(str(path.resolve()) for path in datasets), epochs, learning_rate,
-        weight_decay, patience, frames, seed, batch, force_penalty, warm_start,
-        str(start.resolve()) if start else "", by_sigma, integrator,
-    )  # fmt: skip
+        method,
+        tuple(str(path.resolve()) for path in datasets),
+        epochs,
+        learning_rate,
+        weight_decay,
+        patience,
+        frames,
+        seed,
+        batch,
+        force_penalty,
+        warm_start,
+        str(start.resolve()) if start else "",
+        by_sigma,
+        integrator,
+    )
     first = rank() == 0  # of the processes that torchrun started
     open_writer = _summary_writer() if tensorboard else None
     if first:

@@ -41,9 +41,14 @@ def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> Non
 
 
 def picture(
-    dots: list[tuple[float, float, float, float, float]], size: tuple[int, int] = (200, 160), dark: bool = True,
-    blur: float = 1.0, noise: float = 0.0, seed: int = 0, contrast: float = 130.0,
-) -> np.ndarray:  # fmt: skip
+    dots: list[tuple[float, float, float, float, float]],
+    size: tuple[int, int] = (200, 160),
+    dark: bool = True,
+    blur: float = 1.0,
+    noise: float = 0.0,
+    seed: int = 0,
+    contrast: float = 130.0,
+) -> np.ndarray:
     """Ellipses (x, y, long and short semi-axis, angle) drawn much finer and averaged down."""
     n = 8
     cover = np.zeros(size[::-1])
@@ -102,9 +107,14 @@ def ramp(frame: int) -> np.ndarray:
 
 
 def write_video(
-    path: Path, codec: str, pixels: str, rate: int = 100, options: dict[str, str] | None = None,
-    pictures: list[np.ndarray] | None = None, title: str = "",
-) -> None:  # fmt: skip
+    path: Path,
+    codec: str,
+    pixels: str,
+    rate: int = 100,
+    options: dict[str, str] | None = None,
+    pictures: list[np.ndarray] | None = None,
+    title: str = "",
+) -> None:
     """Of pictures (H, W), or of ramps that grow lighter."""
     pictures = pictures or [ramp(number) for number in range(FRAMES)]
     with av.open(str(path), "w") as output:

@@ -132,9 +132,14 @@ def _timeline(tracks: Tracks) -> str:
     figure, axes = plt.subplots(figsize=(9, min(max(height, 1.4), 9)), layout="constrained")
     end = tracks.time[-1] + 1.0 / tracks.fps
     axes.imshow(
-        tracks.state.T, aspect="auto", interpolation="nearest", cmap=ListedColormap(STATE_COLOURS), vmin=0, vmax=2,
+        tracks.state.T,
+        aspect="auto",
+        interpolation="nearest",
+        cmap=ListedColormap(STATE_COLOURS),
+        vmin=0,
+        vmax=2,
         extent=(tracks.time[0], end, len(tracks.names) - 0.5, -0.5),
-    )  # fmt: skip
+    )
     every = max(len(tracks.names) // 40, 1)
     axes.set_yticks(range(0, len(tracks.names), every), tracks.names[::every], fontsize=7)
     axes.set_xlabel("time [s]")

@@ -21,9 +21,13 @@ from rafl.common.errors import InputError
 Array = NDArray[Any]
 
 FACES = {  # by the face filmed, the line of sight
-    "x-min": (1.0, 0.0, 0.0), "x-max": (-1.0, 0.0, 0.0), "y-min": (0.0, 1.0, 0.0), "y-max": (0.0, -1.0, 0.0),
-    "z-min": (0.0, 0.0, 1.0), "z-max": (0.0, 0.0, -1.0),
-}  # fmt: skip
+    "x-min": (1.0, 0.0, 0.0),
+    "x-max": (-1.0, 0.0, 0.0),
+    "y-min": (0.0, 1.0, 0.0),
+    "y-max": (0.0, -1.0, 0.0),
+    "z-min": (0.0, 0.0, 1.0),
+    "z-max": (0.0, 0.0, -1.0),
+}
 AT_REST = 1.0  # px: a dot that moves farther than this is not at rest
 DEEP = 0.1  # of the width: a face seen narrower than this is seen from its edge
 ALIKE = 1.5  # times the residual: faces whose misfits differ by less cannot be told apart

@@ -41,7 +41,7 @@ class Scene:
 
 
 @njit(cache=True, nogil=True)
-def _cover(rows, columns, ellipse, smear, instants, samples):  # type: ignore[no-untyped-def]
+def _cover(rows, columns, ellipse, smear, instants, samples):
     """The share of the exposure that each fine sample is inside the moving ellipse."""
     x, y, a, b = ellipse[0], ellipse[1], ellipse[2], ellipse[3]
     cos, sin = np.cos(ellipse[4]), np.sin(ellipse[4])

@@ -61,9 +61,13 @@ class CaptureSettings:
 
 
 def build_dataset(
-    specimen: Specimen, folder: Path, rows: list[RecordingRow], settings: CaptureSettings, recipe: str,
+    specimen: Specimen,
+    folder: Path,
+    rows: list[RecordingRow],
+    settings: CaptureSettings,
+    recipe: str,
     tick: Callable[[], None],
-) -> Dataset:  # fmt: skip
+) -> Dataset:
     """Build a dataset of a specimen's recordings.
 
     Args:
@@ -142,9 +146,13 @@ def _selected(item: Recorded, specimen: Specimen, name: str) -> Recorded:
 
 
 def _trajectory(
-    dataset: Dataset, specimen: Specimen, item: Recorded, row: RecordingRow, registration: Registration,
+    dataset: Dataset,
+    specimen: Specimen,
+    item: Recorded,
+    row: RecordingRow,
+    registration: Registration,
     settings: CaptureSettings,
-) -> Trajectory:  # fmt: skip
+) -> Trajectory:
     """One recording on an even grid of times from its release on, its first frame fitted."""
     skin, simulator = len(specimen.layout.names), dataset.simulator
     position = registration.pose.apply(item.position[:, :skin])
@@ -171,8 +179,16 @@ def _trajectory(
     pose = initial.pose if registration.guessed else registration.pose.at(slice(release.start, release.start + 1))
     left = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - initial.pose.apply(frame.target)
     return Trajectory(
-        time, markers, np.isfinite(markers[..., 0]), sigma, initial.q, velocity, initial.force,
-        load_force(simulator, specimen.loaded, load), added, row.split,
+        time,
+        markers,
+        np.isfinite(markers[..., 0]),
+        sigma,
+        initial.q,
+        velocity,
+        initial.force,
+        load_force(simulator, specimen.loaded, load),
+        added,
+        row.split,
         {
             "load_g": row.load_g,
             "load": row.load,
@@ -192,7 +208,7 @@ def _trajectory(
             "fit_markers_mm": 1e3 * np.linalg.norm(left, axis=1),
             "source": item.source,
         },
-    )  # fmt: skip
+    )
 
 
 def _first_frame(

@@ -21,10 +21,15 @@ def recordings_table(dataset: Dataset) -> Table:
         still = int(str(values.get("still_frames", 0)))
         begins = f"{values.get('first_frame', '-')}" + (f" (mean of {still} before)" if still else "")
         table.add_row(
-            name, item.split, f"{_number(values.get('load_g'), 'g')} {values.get('load', '')}", str(len(item.time)),
-            f"{item.valid.mean():.1%}", begins, _number(values.get("registration_residual_mm"), ".3f"),
+            name,
+            item.split,
+            f"{_number(values.get('load_g'), 'g')} {values.get('load', '')}",
+            str(len(item.time)),
+            f"{item.valid.mean():.1%}",
+            begins,
+            _number(values.get("registration_residual_mm"), ".3f"),
             _number(values.get("fit_residual_mm"), ".3f"),
-        )  # fmt: skip
+        )
     return table
 
 

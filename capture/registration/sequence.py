@@ -39,7 +39,7 @@ def fit_by_sequence(frame: FirstFrame, iterations: int = ITERATIONS) -> InitialS
         steps = iter(range(STEPS))
 
         def pull(q: Tensor, v: Tensor, external: Tensor, steps: object = steps) -> Tensor:
-            return torch.zeros_like(q).index_copy(1, nodes, sequence[next(steps)][None])  # type: ignore[call-overload]
+            return torch.zeros_like(q).index_copy(1, nodes, sequence[next(steps)][None])
 
         optimiser.zero_grad()
         q = rollout(simulator, start, STEPS, pull)[0][:, 0]

@@ -141,9 +141,12 @@ def write_board_images(folder: Path, rig: Rig, look: Look, random: np.random.Gen
     columns, rows = (int(0.92 * size / smallest / (1e-3 * BOARD_MM[0])) for size in IMAGE_SIZE)
     squares = (columns, rows)
     pattern = CharucoPattern(
-        kind="charuco", squares=squares, square_mm=BOARD_MM[0], marker_mm=BOARD_MM[1],
+        kind="charuco",
+        squares=squares,
+        square_mm=BOARD_MM[0],
+        marker_mm=BOARD_MM[1],
         dictionary="DICT_4X4_250",
-    )  # fmt: skip
+    )
     print_scale = 24  # print pixels per mm
     texture = pattern.opencv_board().generateImage(
         (int(squares[0] * BOARD_MM[0] * print_scale), int(squares[1] * BOARD_MM[0] * print_scale)),

@@ -43,7 +43,7 @@ class Look:
 
 
 @njit(cache=True, nogil=True)
-def _wave(angle):  # type: ignore[no-untyped-def]
+def _wave(angle):
     """A sine made of parabolas, 6 % off at most, which is no matter for a skin and much quicker."""
     turn = angle / (2.0 * np.pi)
     turn -= np.floor(turn + 0.5)
@@ -51,13 +51,13 @@ def _wave(angle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _texture(x, y, z):  # type: ignore[no-untyped-def]
+def _texture(x, y, z):
     """A mottled skin, about -1 to 1, fixed to the body; x, y, z in mm."""
     return 0.7 * _wave(1.9 * x + 0.7 * y) * _wave(1.3 * z - 1.1 * y) + 0.4 * _wave(5.3 * x - 4.1 * z + 3.1 * y)
 
 
 @njit(cache=True, nogil=True)
-def _draw_quads(image, corners, rest, shade, first, dots, radius, softness, skin, dot, shift):  # type: ignore[no-untyped-def]
+def _draw_quads(image, corners, rest, shade, first, dots, radius, softness, skin, dot, shift):
     """Paint quads, far to near, into `image` (H, W).
 
     corners (S, 4, 2) [px]; rest (S, 4, 3) and dots (K, 3) and radius [mm]; dots first[s]:first[s + 1]
@@ -148,9 +148,18 @@ class Painter:
             chosen = [self.dots[k] for s in order for k in touching[s]]
             layer = self.backdrop.copy()
             _draw_quads(
-                layer, corners[order], rest[order], self._shade(q[surface[order]]), first,
-                np.array(chosen).reshape(-1, 3), 1e3 * self.look.dot_radius, softness, SKIN, DOT, place,
-            )  # fmt: skip
+                layer,
+                corners[order],
+                rest[order],
+                self._shade(q[surface[order]]),
+                first,
+                np.array(chosen).reshape(-1, 3),
+                1e3 * self.look.dot_radius,
+                softness,
+                SKIN,
+                DOT,
+                place,
+            )
             picture += layer / len(positions)
         return develop(picture, self.look, random)
 

@@ -31,7 +31,7 @@ def user_command(command: Command) -> Command:
             typer.echo("stopped; nothing half-written was left behind", err=True)
             raise typer.Exit(130) from None
 
-    return wrapped  # type: ignore[return-value]
+    return wrapped
 
 
 def command_line(help_text: str) -> typer.Typer:

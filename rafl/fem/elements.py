@@ -27,7 +27,7 @@ from rafl.fem.kernel_layout import (
     WEIGHT,
     U,
     V,
-)  # fmt: skip
+)
 from rafl.fem.laws import corotated, neo_hookean, projective
 from rafl.fem.simd import KERNEL, lane_products, transposed_product, weighted_rows
 from rafl.fem.svd import signed_svd_lanes
@@ -48,7 +48,7 @@ _to_stiffness = transposed_product(24)
 
 
 @njit(**KERNEL)
-def _project_lanes(w):  # type: ignore[no-untyped-def]
+def _project_lanes(w):
     """Make the law's second derivatives positive semi-definite, lane by lane."""
     A = np.empty((3, 3))
     for g in range(8):
@@ -74,7 +74,7 @@ def _project_lanes(w):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _stress(w):  # type: ignore[no-untyped-def]
+def _stress(w):
     """Weight times P = U diag(first) V^T, and the twist stiffnesses."""
     for i in range(3):
         for j in range(3):
@@ -93,7 +93,7 @@ def _stress(w):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _tangent(w):  # type: ignore[no-untyped-def]
+def _tangent(w):
     """Weight times d P / d F (9 x 9) from nine modes: three stretches, and two matrices of each pair."""
     for m in range(3):
         after = (m + 1) % 3
@@ -139,7 +139,7 @@ def _tangent(w):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _damp(w, moduli, velocity, strain, rate, strain_rate, project, tangent):  # type: ignore[no-untyped-def]
+def _damp(w, moduli, velocity, strain, rate, strain_rate, project, tangent):
     """Add viscous stress F (2 eta E') and stiffness-proportional stress to STRESS, ENERGY and TANGENT.
 
     velocity (9, 8): its rest-frame gradient; strain (8, 6): what is subtracted from strain_rate * E.
@@ -197,7 +197,7 @@ def _damp(w, moduli, velocity, strain, rate, strain_rate, project, tangent):  # 
 
 
 @njit(**KERNEL)
-def _cell(w, x, by_point, by_node, law, mu, lam, damped, moduli, velocity, strain, rate, strain_rate, project, tangent):  # type: ignore[no-untyped-def]
+def _cell(w, x, by_point, by_node, law, mu, lam, damped, moduli, velocity, strain, rate, strain_rate, project, tangent):
     """Add one group of eight points to the scratch's FORCE and STIFFNESS; returns the energy [J].
 
     x: corner positions, then velocities, (48).
@@ -236,10 +236,13 @@ def _cell(w, x, by_point, by_node, law, mu, lam, damped, moduli, velocity, strai
                 for g in range(8):
                     for j in range(3):
                         _couple(
-                            w, (PRODUCT + 3 * g + j) * 8,
-                            w, (TANGENT + 9 * (3 * i + j) + 3 * k) * 8 + g,
-                            w, (SLOPES + 3 * g) * 8,
-                        )  # fmt: skip
+                            w,
+                            (PRODUCT + 3 * g + j) * 8,
+                            w,
+                            (TANGENT + 9 * (3 * i + j) + 3 * k) * 8 + g,
+                            w,
+                            (SLOPES + 3 * g) * 8,
+                        )
                 _to_stiffness(w, (STIFFNESS + 8 * block) * 8, w, SLOPES * 8, w, PRODUCT * 8)
                 block += 1
     return energy
@@ -247,9 +250,25 @@ def _cell(w, x, by_point, by_node, law, mu, lam, damped, moduli, velocity, strai
 
 @njit(parallel=True, **KERNEL)
 def element_terms(
-    q, hexes, by_point, by_node, volume, shares, law, moduli, damped, drift, strain, rate, strain_rate,
-    project, tangent, energy, gradient, stiffness,
-):  # type: ignore[no-untyped-def]  # fmt: skip
+    q,
+    hexes,
+    by_point,
+    by_node,
+    volume,
+    shares,
+    law,
+    moduli,
+    damped,
+    drift,
+    strain,
+    rate,
+    strain_rate,
+    project,
+    tangent,
+    energy,
+    gradient,
+    stiffness,
+):
     """Fill energy (B), nodal gradient (B, N, 3) and, if `tangent`, stiffness (B, E, 6, 8, 8).
 
     Args:
@@ -295,9 +314,22 @@ def element_terms(
                 own[4] = moduli[t, 4] * shares[group, 1]
                 past = strain[t, e, 8 * group : 8 * group + 8] if damped else strain[0, 0]
                 total += _cell(
-                    w, x, by_point[e, group], by_node[e, group], law, own[0], moduli[t, 1] * shares[group, 1],
-                    damped, own, velocity, past, rate, strain_rate, project, tangent,
-                )  # fmt: skip
+                    w,
+                    x,
+                    by_point[e, group],
+                    by_node[e, group],
+                    law,
+                    own[0],
+                    moduli[t, 1] * shares[group, 1],
+                    damped,
+                    own,
+                    velocity,
+                    past,
+                    rate,
+                    strain_rate,
+                    project,
+                    tangent,
+                )
             for i in range(24):
                 force[t, e, i] = w[FORCE * 8 + i]
             if tangent:
@@ -315,7 +347,7 @@ def element_terms(
 
 
 @njit(parallel=True, **KERNEL)
-def multiply(stiffness, cells, hexes, x, out):  # type: ignore[no-untyped-def]
+def multiply(stiffness, cells, hexes, x, out):
     """Fill out (B, N, 3) with the stiffnesses (B, E, 6, 8, 8) of some cells times x (B, N, 3)."""
     for t in prange(x.shape[0]):
         out[t] = 0.0

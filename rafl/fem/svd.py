@@ -11,7 +11,7 @@ TINY = 1e-100  # of the largest stretch: the square of a smaller one is rounded 
 
 
 @njit(**KERNEL)
-def signed_svd(F, U, s, V):  # type: ignore[no-untyped-def]
+def signed_svd(F, U, s, V):
     """F = U diag(s) V^T by one-sided Jacobi; U, V rotations, s descending, only s[2] may be negative.
 
     F (3, 3) is read; U (3, 3), s (3), V (3, 3) are filled. Repeated stretches are no special case.
@@ -85,7 +85,7 @@ def signed_svd(F, U, s, V):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def signed_svd_lanes(w):  # type: ignore[no-untyped-def]
+def signed_svd_lanes(w):
     """`signed_svd` of the scratch's eight deformation gradients at once.
 
     Stretches come in any order; one is negative only where the determinant is.
@@ -164,7 +164,7 @@ def signed_svd_lanes(w):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _decompose_lane(w, g):  # type: ignore[no-untyped-def]
+def _decompose_lane(w, g):
     F = np.empty((3, 3))
     left = np.empty((3, 3))
     right = np.empty((3, 3))

@@ -199,11 +199,14 @@ class _Search:
         if not self.history:
             self.record(start, 0)
         found = minimize(
-            relative, start / STRIDE, jac=True, method="L-BFGS-B",
+            relative,
+            start / STRIDE,
+            jac=True,
+            method="L-BFGS-B",
             bounds=[(q.bounds[0] / STRIDE, q.bounds[1] / STRIDE) for q in self.quantities],
             callback=lambda y: self.record(y * STRIDE, int(self.history[-1]["epoch"]) + 1),
             options={"maxiter": iterations, "ftol": 1e-9, "gtol": 1e-8},
-        )  # fmt: skip
+        )
         return scale * float(found.fun), found.x * STRIDE
 
     def record(self, x: Array, number: int) -> None:

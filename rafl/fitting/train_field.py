@@ -189,9 +189,15 @@ class _Training:
             if start.field is None:
                 self._prepare(datasets)
             warm_start(
-                self.field, whole, run, settings.warm_start, settings.seed,
-                lambda: 1e3 * mean_error(self.validate, self.model), self.report, learned=start.field is not None,
-            )  # fmt: skip
+                self.field,
+                whole,
+                run,
+                settings.warm_start,
+                settings.seed,
+                lambda: 1e3 * mean_error(self.validate, self.model),
+                self.report,
+                learned=start.field is not None,
+            )
         self.optimiser = torch.optim.Adam(
             self.field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )

@@ -14,7 +14,7 @@ FEATURES = 34
 
 
 @njit(cache=True, parallel=True)
-def _batched_svd(F, U, s, V):  # type: ignore[no-untyped-def]
+def _batched_svd(F, U, s, V):
     for index in prange(F.shape[0]):
         signed_svd(F[index], U[index], s[index], V[index])
 
@@ -27,7 +27,7 @@ class _PolarStretch(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx, F: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def forward(ctx, F: Tensor) -> tuple[Tensor, Tensor]:
         array = F.detach().numpy()
         U, V = np.empty_like(array), np.empty_like(array)
         s = np.empty(array.shape[:-1])
@@ -37,7 +37,7 @@ class _PolarStretch(torch.autograd.Function):
         return left @ right.mT, stretch.flip(-1)
 
     @staticmethod
-    def backward(ctx, by_R: Tensor, by_s: Tensor) -> Tensor:  # type: ignore[override]
+    def backward(ctx, by_R: Tensor, by_s: Tensor) -> Tensor:
         U, s, V = ctx.saved_tensors
         N = U.mT @ by_R @ V
         total = s[:, :, None] + s[:, None, :]

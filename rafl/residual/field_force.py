@@ -60,7 +60,7 @@ def accelerations(inputs: Tensor, weights: Sequence[Tensor]) -> list[Tensor]:
 
 
 @njit(cache=True, error_model="numpy")
-def by_elu(derivatives, values):  # type: ignore[no-untyped-def]
+def by_elu(derivatives, values):
     """Multiply derivatives by ELU's values (W, P) with its slopes: one where a value is positive, else value + 1."""
     by, value = derivatives.ravel(), values.ravel()
     none, one = by.dtype.type(0.0), by.dtype.type(1.0)
@@ -75,7 +75,7 @@ class FieldForce(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(ctx: Any, q: Tensor, v: Tensor, points: FieldPoints, *weights: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, q: Tensor, v: Tensor, points: FieldPoints, *weights: Tensor) -> Tensor:
         """Evaluate."""
         inputs, kept = points.features(*(np.ascontiguousarray(x.detach().numpy()) for x in (q, v)))
         *layers, last = accelerations(torch.from_numpy(inputs).to(weights[0].dtype), weights)
@@ -87,7 +87,7 @@ class FieldForce(torch.autograd.Function):
         return torch.from_numpy(force)
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Derivatives by state and weights."""
         weights, points, kept, layers = ctx.saved_tensors, ctx.points, ctx.kept, ctx.layers
         by_points = np.empty((6, ctx.acceleration.shape[1]))
@@ -104,7 +104,14 @@ class FieldForce(torch.autograd.Function):
         if ctx.needs_input_grad[0] or ctx.needs_input_grad[1]:
             by_inputs = np.ascontiguousarray(by_layer.double().numpy())
             by_state(
-                by_inputs, by_points[:3], ctx.acceleration, kept, points.hexes, points.slopes, points.gravity,
-                by_q, by_v,
-            )  # fmt: skip
+                by_inputs,
+                by_points[:3],
+                ctx.acceleration,
+                kept,
+                points.hexes,
+                points.slopes,
+                points.gravity,
+                by_q,
+                by_v,
+            )
         return torch.from_numpy(by_q), torch.from_numpy(by_v), None, *by_weights

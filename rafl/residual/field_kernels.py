@@ -41,28 +41,28 @@ _row_by_row = lane_products(3, 8, 8)  # (A B^T)_ij
 
 
 @njit(**KERNEL)
-def _product(w, out, a, b):  # type: ignore[no-untyped-def]
+def _product(w, out, a, b):
     for i in range(3):
         for j in range(3):
             _row_by_column(w, (out + 3 * i + j) * 8, w, (a + 3 * i) * 8, w, (b + j) * 8)
 
 
 @njit(**KERNEL)
-def _transposed_product(w, out, a, b):  # type: ignore[no-untyped-def]
+def _transposed_product(w, out, a, b):
     for i in range(3):
         for j in range(3):
             _column_by_column(w, (out + 3 * i + j) * 8, w, (a + i) * 8, w, (b + j) * 8)
 
 
 @njit(**KERNEL)
-def _product_transposed(w, out, a, b):  # type: ignore[no-untyped-def]
+def _product_transposed(w, out, a, b):
     for i in range(3):
         for j in range(3):
             _row_by_row(w, (out + 3 * i + j) * 8, w, (a + 3 * i) * 8, w, (b + 3 * j) * 8)
 
 
 @njit(**KERNEL)
-def _invert(w):  # type: ignore[no-untyped-def]
+def _invert(w):
     """The right stretch tensor's inverse and its determinant."""
     for i in range(3):
         for j in range(3):
@@ -86,7 +86,7 @@ def _invert(w):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _local_motion(w):  # type: ignore[no-untyped-def]
+def _local_motion(w):
     """From F and RATE: rotation, right stretch tensor and its inverse, co-rotated velocity gradient."""
     signed_svd_lanes(w)
     _product_transposed(w, TURN, U, V)
@@ -97,7 +97,7 @@ def _local_motion(w):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, **KERNEL)
-def local_features(q, v, hexes, slopes, gravity, kept, inputs):  # type: ignore[no-untyped-def]
+def local_features(q, v, hexes, slopes, gravity, kept, inputs):
     """Fill inputs (34, B E 8) and what the derivatives need again, kept (B, E, KEPT, 8).
 
     Args:
@@ -139,7 +139,7 @@ def local_features(q, v, hexes, slopes, gravity, kept, inputs):  # type: ignore[
 
 
 @njit(**KERNEL)
-def _write_features(w, gravity, inputs, first):  # type: ignore[no-untyped-def]
+def _write_features(w, gravity, inputs, first):
     for g in range(8):
         p = first + g
         a, b, c = w[STRETCH * 8 + g], w[(STRETCH + 1) * 8 + g], w[(STRETCH + 2) * 8 + g]
@@ -186,7 +186,7 @@ def _write_features(w, gravity, inputs, first):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, **KERNEL)
-def nodal_forces(acceleration, kept, mass, shape, hexes, force):  # type: ignore[no-untyped-def]
+def nodal_forces(acceleration, kept, mass, shape, hexes, force):
     """Fill force (B, N, 3): sum over points of shape function times mass times R times acceleration (3, B E 8)."""
     cells = len(hexes)
     part = np.empty((len(force), cells, 8, 3))
@@ -210,7 +210,7 @@ def nodal_forces(acceleration, kept, mass, shape, hexes, force):  # type: ignore
 
 
 @njit(parallel=True, **KERNEL)
-def by_acceleration(by_force, kept, mass, shape, hexes, out):  # type: ignore[no-untyped-def]
+def by_acceleration(by_force, kept, mass, shape, hexes, out):
     """Fill out (6, B E 8): derivatives by the pull on each point in the world's frame, then by its acceleration."""
     cells = len(hexes)
     for c in prange(len(by_force) * cells):
@@ -228,7 +228,7 @@ def by_acceleration(by_force, kept, mass, shape, hexes, out):  # type: ignore[no
 
 
 @njit(parallel=True, **KERNEL)
-def by_state(by_inputs, by_pull, acceleration, kept, hexes, slopes, gravity, by_q, by_v):  # type: ignore[no-untyped-def]
+def by_state(by_inputs, by_pull, acceleration, kept, hexes, slopes, gravity, by_q, by_v):
     """Fill derivatives by positions and velocities, both (B, N, 3).
 
     Args:
@@ -279,7 +279,7 @@ def by_state(by_inputs, by_pull, acceleration, kept, hexes, slopes, gravity, by_
 
 
 @njit(**KERNEL)
-def _by_motion(w, by_inputs, by_pull, acceleration, gravity, first):  # type: ignore[no-untyped-def]
+def _by_motion(w, by_inputs, by_pull, acceleration, gravity, first):
     """Derivatives by F and by the velocity gradient's numerator, of one cell."""
     _product_transposed(w, TURN, U, V)
     _transposed_product(w, STRETCHED, TURN, DEFORMATION)
@@ -320,14 +320,14 @@ def _by_motion(w, by_inputs, by_pull, acceleration, gravity, first):  # type: ig
 
 
 @njit(**KERNEL)
-def _accumulate(w, out, a, sign):  # type: ignore[no-untyped-def]
+def _accumulate(w, out, a, sign):
     for r in range(9):
         for g in range(8):
             w[(out + r) * 8 + g] += sign * w[(a + r) * 8 + g]
 
 
 @njit(**KERNEL)
-def _by_local(w, by_inputs, first):  # type: ignore[no-untyped-def]
+def _by_local(w, by_inputs, first):
     """Derivatives by the co-rotated velocity gradient."""
     for g in range(8):
         p = first + g
@@ -370,7 +370,7 @@ def _by_local(w, by_inputs, first):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _by_decomposition(w, by_inputs, first):  # type: ignore[no-untyped-def]
+def _by_decomposition(w, by_inputs, first):
     """Adds to the derivatives by F those through rotation and stretches; see `rafl.residual.features` for the formulae."""
     for g in range(8):
         p = first + g

@@ -43,10 +43,17 @@ class Minimum(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(  # type: ignore[override]
-        ctx: Any, target: Tensor, inertia: Tensor, force: Tensor, held: Tensor, moduli: Tensor,
-        drift: Tensor | None, strain: Tensor | None, setting: Setting,
-    ) -> Tensor:  # fmt: skip
+    def forward(
+        ctx: Any,
+        target: Tensor,
+        inertia: Tensor,
+        force: Tensor,
+        held: Tensor,
+        moduli: Tensor,
+        drift: Tensor | None,
+        strain: Tensor | None,
+        setting: Setting,
+    ) -> Tensor:
         """Solve."""
         simulator = setting.simulator
         resistance = _resistance(moduli, drift, strain, setting)
@@ -65,7 +72,7 @@ class Minimum(torch.autograd.Function):
         return result
 
     @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Derivatives by each input."""
         x, target, inertia, moduli, drift, strain = ctx.saved_tensors
         simulator, engine = ctx.setting.simulator, ctx.setting.simulator.engine
@@ -93,8 +100,13 @@ class Minimum(torch.autograd.Function):
         return (
             inertia[..., None] * by if needs[0] else None,
             -(by * (x - target)).sum(-1) if needs[1] else None,
-            by, by_held, by_moduli, by_drift, by_strain, None,
-        )  # fmt: skip
+            by,
+            by_held,
+            by_moduli,
+            by_drift,
+            by_strain,
+            None,
+        )
 
 
 def _array(tensor: Tensor) -> np.ndarray:

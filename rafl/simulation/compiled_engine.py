@@ -79,12 +79,25 @@ class Compiled:
         stiffness = np.empty((batch if tangent else 0, len(self.mesh.hexes), 6, 8, 8))
         none = np.zeros((1, 1, 1, 1))
         element_terms(
-            q, self.mesh.hexes, self._by_point, self._by_node, self._volume, self.integration.shares, self.law,
-            resistance.moduli, resistance.damped,
+            q,
+            self.mesh.hexes,
+            self._by_point,
+            self._by_node,
+            self._volume,
+            self.integration.shares,
+            self.law,
+            resistance.moduli,
+            resistance.damped,
             none[0] if resistance.drift is None else resistance.drift,
             none if resistance.strain is None else resistance.strain,
-            resistance.rate, resistance.strain_rate, project, tangent, energy, gradient, stiffness,
-        )  # fmt: skip
+            resistance.rate,
+            resistance.strain_rate,
+            project,
+            tangent,
+            energy,
+            gradient,
+            stiffness,
+        )
         return energy, gradient, stiffness
 
     def multiply(self, tangents: Array, x: Array) -> Array:

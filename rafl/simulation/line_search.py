@@ -11,7 +11,7 @@ LEVEL = 1e-13  # of the energy's parts, what two equal energies may differ by
 
 
 @njit(**PLAIN)
-def moved(q, rows, free, step, length):  # type: ignore[no-untyped-def]
+def moved(q, rows, free, step, length):
     """Positions (P, 3 N) of q (B, 3 N) at `rows` (P), their free places (n) moved by length (P) times step (P, n)."""
     trial = np.empty((len(rows), q.shape[1]))
     for p in range(len(rows)):
@@ -22,7 +22,7 @@ def moved(q, rows, free, step, length):  # type: ignore[no-untyped-def]
 
 
 @njit(**PLAIN)
-def balance(at, gradient, free, inertia, target, force, residual):  # type: ignore[no-untyped-def]
+def balance(at, gradient, free, inertia, target, force, residual):
     """Fill one body's residual (n) [N]; its inertial energy, the forces' work [J] and the largest residual [N].
 
     Args:
@@ -47,7 +47,7 @@ def balance(at, gradient, free, inertia, target, force, residual):  # type: igno
 
 
 @njit(**PLAIN)
-def begin(q, elastic, gradient, free, inertia, target, force, energy, residual, largest):  # type: ignore[no-untyped-def]
+def begin(q, elastic, gradient, free, inertia, target, force, energy, residual, largest):
     """Fill the energy (B), residual (B, n) and largest residual (B) of a batch where it is; arguments as of `judge`."""
     for b in range(len(q)):
         inertial, work, size = balance(q[b], gradient[b].ravel(), free, inertia[b], target[b], force[b], residual[b])
@@ -55,10 +55,28 @@ def begin(q, elastic, gradient, free, inertia, target, force, energy, residual, 
 
 
 @njit(**PLAIN)
-def judge(  # type: ignore[no-untyped-def]
-    trial, elastic, gradient, rows, old, length, slope, free, inertia, target, force, stiffest, reach, enough, patience,
-    q, energy, residual, largest, ready,
-):  # fmt: skip
+def judge(
+    trial,
+    elastic,
+    gradient,
+    rows,
+    old,
+    length,
+    slope,
+    free,
+    inertia,
+    target,
+    force,
+    stiffest,
+    reach,
+    enough,
+    patience,
+    q,
+    energy,
+    residual,
+    largest,
+    ready,
+):
     """Take over the trials that are good enough; which are to be tried again, (P).
 
     A step by an old factor is good when it halves the residual and does not raise the energy; if it is not, the factor

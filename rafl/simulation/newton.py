@@ -72,9 +72,16 @@ def minimise(
 
 
 def _descend(
-    engine: Engine, start: Array, inertia: Array, target: Array, force: Array, resistance: Resistance, what: str,
-    factors: Factors, longest: float,
-) -> Array:  # fmt: skip
+    engine: Engine,
+    start: Array,
+    inertia: Array,
+    target: Array,
+    force: Array,
+    resistance: Resistance,
+    what: str,
+    factors: Factors,
+    longest: float,
+) -> Array:
     """`minimise` with steps that change no edge by more than `longest` times its length."""
     batch, shape = len(start), start.shape[1:]
     free = engine.free_index
@@ -114,9 +121,23 @@ def _descend(
         for _ in range(40):
             trial = moved(q, running, free, step, length)
             again = judge(
-                trial, *elastic(running, trial), running, old, length, slope, *pulls, stiffest, reach, enough,
-                engine.patience, q, energy, residual, largest, factors.ready,
-            )  # fmt: skip
+                trial,
+                *elastic(running, trial),
+                running,
+                old,
+                length,
+                slope,
+                *pulls,
+                stiffest,
+                reach,
+                enough,
+                engine.patience,
+                q,
+                energy,
+                residual,
+                largest,
+                factors.ready,
+            )
             if not again.any():
                 break
             running, old, step, slope, length = (x[again] for x in (running, old, step, slope, 0.5 * length))
@@ -140,9 +161,15 @@ def _scattered(step: Array, free: Array, unknowns: int) -> Array:
 
 
 def _factor(
-    engine: Engine, q: Array, resistance: Resistance, factors: Factors, rows: Array, diagonal: Array, what: str,
+    engine: Engine,
+    q: Array,
+    resistance: Resistance,
+    factors: Factors,
+    rows: Array,
+    diagonal: Array,
+    what: str,
     largest: Array,
-) -> None:  # fmt: skip
+) -> None:
     _, _, tangents = engine.terms(q, resistance, tangent=True)
     left = np.flatnonzero(~engine.factor(factors, rows, tangents, diagonal))
     if not len(left):

@@ -119,10 +119,9 @@ class Plain:
         strain = resistance.strain_rate * 0.5 * (F.mT @ F - identity) - memory
         S = 2.0 * eta * strain
         P = F @ S + 2.0 * mu * shear + lam * trace * identity
-        energy = (
-            (eta / resistance.strain_rate * strain**2 + mu / resistance.rate * shear**2).sum((-2, -1))
-            + (0.5 * lam / resistance.rate * trace**2)[..., 0, 0]
-        )  # fmt: skip
+        energy = (eta / resistance.strain_rate * strain**2 + mu / resistance.rate * shear**2).sum((-2, -1)) + (
+            0.5 * lam / resistance.rate * trace**2
+        )[..., 0, 0]
         if not tangent:
             return energy, P, F.new_zeros(0)
         lazy = (eta * resistance.strain_rate)[..., None, None]

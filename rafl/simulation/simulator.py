@@ -112,9 +112,15 @@ class Simulator:
         return self.engine.terms(q, self.resistance(len(q)), tangent=False)[1]
 
     def minimise(
-        self, start: Array, inertia: Array, target: Array, force: Array, resistance: Resistance, what: str,
+        self,
+        start: Array,
+        inertia: Array,
+        target: Array,
+        force: Array,
+        resistance: Resistance,
+        what: str,
         factors: Factors | None = None,
-    ) -> Array:  # fmt: skip
+    ) -> Array:
         """`rafl.simulation.newton.minimise` with this specimen's arithmetic."""
         with self.engine.threads(len(start)):
             return minimise(self.engine, start, inertia, target, force, resistance, what, factors)

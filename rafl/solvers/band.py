@@ -27,7 +27,7 @@ def allocate(batch: int, n: int, width: int) -> NDArray[np.float64]:
 
 
 @njit(parallel=True, **KERNEL)
-def factor_bands(stiffness, diagonal, entries, destination, rows, bands, length, pivots):  # type: ignore[no-untyped-def]
+def factor_bands(stiffness, diagonal, entries, destination, rows, bands, length, pivots):
     """Assemble and factor K + diagonal = L D L^T for each trajectory.
 
     Args:
@@ -50,13 +50,13 @@ def factor_bands(stiffness, diagonal, entries, destination, rows, bands, length,
 
 
 @njit(**KERNEL)
-def _add_entries(stiffness, entries, destination, flat):  # type: ignore[no-untyped-def]
+def _add_entries(stiffness, entries, destination, flat):
     for m in range(len(entries)):
         flat[destination[m]] += stiffness[entries[m]]
 
 
 @njit(parallel=True, **KERNEL)
-def scatter(stiffness, entries, destination, rows, flat):  # type: ignore[no-untyped-def]
+def scatter(stiffness, entries, destination, rows, flat):
     """Sum entries (M) of the cells' (R, E * 384) into rows of flat (B, size), at `destination` (M)."""
     pieces = 16
     length = flat.shape[1] // pieces + 1
@@ -68,7 +68,7 @@ def scatter(stiffness, entries, destination, rows, flat):  # type: ignore[no-unt
 
 
 @njit(**KERNEL)
-def _factor(band, n, length):  # type: ignore[no-untyped-def]
+def _factor(band, n, length):
     """Factor one band in place, eight columns at a time; returns its smallest pivot."""
     factors = np.zeros(LANES)
     inverse = np.zeros(LANES)  # of the pivots
@@ -98,7 +98,7 @@ def _factor(band, n, length):  # type: ignore[no-untyped-def]
 
 
 @njit(parallel=True, cache=True, error_model="numpy", fastmath=True)
-def solve_bands(bands, length, rows, x):  # type: ignore[no-untyped-def]
+def solve_bands(bands, length, rows, x):
     """Solve in place for x (R, C, n), C right sides of each factored band."""
     n = x.shape[2]
     columns = x.shape[1]

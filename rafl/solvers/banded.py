@@ -49,9 +49,15 @@ class Banded:
         """Factor `rows` of the batch; True where the matrix was positive definite."""
         pivots = np.empty(len(rows))
         factor_bands(
-            stiffness.reshape(len(rows), -1), diagonal, self.unknowns.entries, self._destination, rows,
-            factors.storage, self._length, pivots,
-        )  # fmt: skip
+            stiffness.reshape(len(rows), -1),
+            diagonal,
+            self.unknowns.entries,
+            self._destination,
+            rows,
+            factors.storage,
+            self._length,
+            pivots,
+        )
         factors.ready[rows] = pivots > 0.0
         return pivots > 0.0
 

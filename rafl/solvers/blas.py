@@ -61,9 +61,18 @@ def solve_transposed_right(lower: Array, b: Array) -> None:
 def _solve(side: bytes, lower: Array, b: Array, transposed: bool) -> None:
     rows, columns = b.shape
     _trsm(
-        side, b"L", b"T" if transposed else b"N", b"N", _int(rows), _int(columns), _ONE,
-        _at(lower), _int(len(lower)), _at(b), _int(rows),
-    )  # fmt: skip
+        side,
+        b"L",
+        b"T" if transposed else b"N",
+        b"N",
+        _int(rows),
+        _int(columns),
+        _ONE,
+        _at(lower),
+        _int(len(lower)),
+        _at(b),
+        _int(rows),
+    )
 
 
 def subtract_square(c: Array, a: Array) -> None:
@@ -76,6 +85,17 @@ def subtract_product(c: Array, a: Array, b: Array, *, transposed: bool = False) 
     """Take a b, or a^T b, from c."""
     rows, columns = c.shape
     _gemm(
-        b"T" if transposed else b"N", b"N", _int(rows), _int(columns), _int(len(b)), _MINUS_ONE, _at(a),
-        _int(a.shape[0]), _at(b), _int(len(b)), _ONE, _at(c), _int(rows),
-    )  # fmt: skip
+        b"T" if transposed else b"N",
+        b"N",
+        _int(rows),
+        _int(columns),
+        _int(len(b)),
+        _MINUS_ONE,
+        _at(a),
+        _int(a.shape[0]),
+        _at(b),
+        _int(len(b)),
+        _ONE,
+        _at(c),
+        _int(rows),
+    )

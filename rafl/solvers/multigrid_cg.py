@@ -47,9 +47,13 @@ class Iterative:
             definite[r] = matrix.diagonal().min() > 0.0
             if definite[r]:
                 grids = pyamg.smoothed_aggregation_solver(
-                    matrix.tobsr((3, 3)), B=self._rigid, strength=("symmetric", {"theta": 0.0}),
-                    smooth="jacobi", improve_candidates=None, max_coarse=300,
-                )  # fmt: skip
+                    matrix.tobsr((3, 3)),
+                    B=self._rigid,
+                    strength=("symmetric", {"theta": 0.0}),
+                    smooth="jacobi",
+                    improve_candidates=None,
+                    max_coarse=300,
+                )
                 factors.storage[row] = matrix, grids.aspreconditioner()
         factors.ready[rows] = definite
         return definite

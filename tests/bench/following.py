@@ -55,7 +55,7 @@ class Judged:
 
 
 def judge(drawn: Drawn) -> Judged:
-    tracks = follow(drawn, lambda: None)  # type: ignore[arg-type]
+    tracks = follow(drawn, lambda: None)
     truth, spacing = drawn.beam.centres, drawn.beam.spacing
     hidden = np.zeros(truth.shape[:2], bool) if drawn.hidden is None else drawn.hidden
     apart = np.linalg.norm(truth[0][:, None] - tracks.start[None], axis=2)

@@ -58,10 +58,13 @@ def calibrating(random: np.random.Generator, quick: bool) -> Iterator[Row]:
         tilt = Rotation.from_rotvec(np.radians(random.uniform(-15, 15, 3))).as_matrix()
         scale = random.uniform(6e3, 12e3)
         camera = OrthographicCamera(
-            image_size=SIZE, scale=(scale, scale * random.uniform(0.998, 1.002)), skew=random.normal(0, 10),
-            rotation_vector=tuple(Rotation.from_matrix(tilt @ SQUARE).as_rotvec()), offset=(150.0, 400.0),
+            image_size=SIZE,
+            scale=(scale, scale * random.uniform(0.998, 1.002)),
+            skew=random.normal(0, 10),
+            rotation_vector=tuple(Rotation.from_matrix(tilt @ SQUARE).as_rotvec()),
+            offset=(150.0, 400.0),
             distortion=(random.normal(0, 2e-3), 0.0),
-        )  # fmt: skip
+        )
         views = random_views(camera, "left", (flat, nearer) if k % 2 else (flat,), random)
         try:
             found = solve_rig({"left": views}, {"left": SIZE}, PLAIN, {}).rig.cameras["left"]

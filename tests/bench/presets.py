@@ -82,12 +82,15 @@ def describe(dataset: Dataset, material: Material) -> list[dict[str, float | str
         rows.append(
             {
                 "recording": name,
-                "recorded Hz": true_frequency, "Hz": frequency,
-                "recorded damping": true_damping, "damping": damping,
-                "recorded drop mm": 1e3 * (straight - recorded[-40:].mean()), "drop mm": 1e3 * (straight - settled[b]),
+                "recorded Hz": true_frequency,
+                "Hz": frequency,
+                "recorded damping": true_damping,
+                "damping": damping,
+                "recorded drop mm": 1e3 * (straight - recorded[-40:].mean()),
+                "drop mm": 1e3 * (straight - settled[b]),
                 "error mm": 1e3 * errors[b].mean(),
             }
-        )  # fmt: skip
+        )
     return rows
 
 

@@ -125,9 +125,14 @@ class Study:
         cells = [lab["refinement"] * (len(axis) - 1) for axis in axes]
         mesh = HexMesh.box(cells, np.ptp(coarse.vertices, axis=0))
         return replace(
-            described, mesh=mesh, material=Material(**lab["material"]), fixed=mesh.face_nodes("x-min"),
-            loaded=mesh.face_nodes("x-max"), integrator=lab["integrator"], substeps=lab["substeps"],
-        )  # fmt: skip
+            described,
+            mesh=mesh,
+            material=Material(**lab["material"]),
+            fixed=mesh.face_nodes("x-min"),
+            loaded=mesh.face_nodes("x-max"),
+            integrator=lab["integrator"],
+            substeps=lab["substeps"],
+        )
 
     def motions(self, shape: str) -> list[Motion]:
         """What happens in the lab, from its file where it stands there."""
@@ -168,15 +173,26 @@ class Study:
                         painter = Painter.of(lab, camera, look, random)
                         film(path, motion, painter, FPS, "h264", 97 * number + view, lambda: bar.advance(task))
         command(
-            "rafl-track", folder / "videos", "--calib", folder / "calib.yaml", "--specimen", self.specimen(shape),
-            "--out", folder / "tracks",
-        )  # fmt: skip
+            "rafl-track",
+            folder / "videos",
+            "--calib",
+            folder / "calib.yaml",
+            "--specimen",
+            self.specimen(shape),
+            "--out",
+            folder / "tracks",
+        )
         rows = [f"{m.name},{1e3 * m.load:g},{split}" for m, split in zip(motions, self.split.values(), strict=True)]
         write_text(folder / "recordings.csv", "\n".join(["recording,load_g,split", *rows, ""]))
         command(
-            "rafl-capture", self.specimen(shape), folder / "tracks", "--recordings", folder / "recordings.csv",
-            "--out", folder / f"{shape}.h5",
-        )  # fmt: skip
+            "rafl-capture",
+            self.specimen(shape),
+            folder / "tracks",
+            "--recordings",
+            folder / "recordings.csv",
+            "--out",
+            folder / f"{shape}.h5",
+        )
 
     def fit(self, shape: str) -> None:
         """Every model that applies."""

@@ -129,8 +129,10 @@ def speed(folder: Path | None) -> None:
         meshes["finer fish-tail"] = (HexMesh.from_grid(np.load(fine), 0.003), ORIGINAL, 30)
     else:
         print("finer fish-tail skipped: no folder with fishtail_fine_cells.npy was given")
-    print(f"{'':20s} {'batch':>5s} | {'forward':>9s} {'authors':>8s} {'faster':>7s} {'yardsticks':>10s} | "
-          f"{'backward':>9s} {'authors':>8s} {'faster':>7s}")  # fmt: skip
+    print(
+        f"{'':20s} {'batch':>5s} | {'forward':>9s} {'authors':>8s} {'faster':>7s} {'yardsticks':>10s} | "
+        f"{'backward':>9s} {'authors':>8s} {'faster':>7s}"
+    )
     for name, (mesh, material, steps) in meshes.items():
         for batch in (1, 9) if len(mesh.hexes) < 1000 else (1,):
             unit = yardstick()
@@ -181,9 +183,13 @@ def grow(times: int) -> dict[str, float]:
     forward, backward = case.milliseconds(20 if times < 4 else 4, 3 if times < 4 else 1)
     solver = case.simulator.engine.linear
     return {
-        "cells": len(mesh.hexes), "unknowns": len(solver.free_index), "solver": type(solver).__name__,
-        "forward": forward, "backward": backward, "peak_mb": peak_mb() - held,
-    }  # fmt: skip
+        "cells": len(mesh.hexes),
+        "unknowns": len(solver.free_index),
+        "solver": type(solver).__name__,
+        "forward": forward,
+        "backward": backward,
+        "peak_mb": peak_mb() - held,
+    }
 
 
 def batches() -> None:

@@ -7,10 +7,17 @@ from rafl.calibration.rig import Rig, read_rig, write_rig
 from rafl.common.errors import InputError
 
 CAMERA = OrthographicCamera(
-    image_size=(640, 480), scale=(9000.0, 9010.0), skew=3.0, rotation_vector=(0.1, 1.5, -0.2), offset=(12.0, 34.0),
-    distortion=(1e-3, 0.0), plane=Plane((0.0, -1.0, 0.0), 0.03, 4e-4), time_offset=0.002, residual=0.05,
+    image_size=(640, 480),
+    scale=(9000.0, 9010.0),
+    skew=3.0,
+    rotation_vector=(0.1, 1.5, -0.2),
+    offset=(12.0, 34.0),
+    distortion=(1e-3, 0.0),
+    plane=Plane((0.0, -1.0, 0.0), 0.03, 4e-4),
+    time_offset=0.002,
+    residual=0.05,
     covariance=tuple(tuple(float(i * j) for j in range(10)) for i in range(10)),
-)  # fmt: skip
+)
 
 
 def test_round_trip(tmp_path: Path) -> None:

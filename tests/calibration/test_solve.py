@@ -24,12 +24,16 @@ def side_camera(tilt_deg: tuple[float, float, float] = (1.0, -0.7, 0.5)) -> Orth
     rotation = Rotation.from_rotvec(np.radians(tilt_deg)).as_matrix() @ square
     vector = Rotation.from_matrix(rotation).as_rotvec()
     return OrthographicCamera(
-        image_size=SIZE, scale=(9810.0, 9800.0), skew=12.0, rotation_vector=tuple(vector), offset=(150.0, 400.0),
+        image_size=SIZE,
+        scale=(9810.0, 9800.0),
+        skew=12.0,
+        rotation_vector=tuple(vector),
+        offset=(150.0, 400.0),
         distortion=(2e-3, -1e-3),
-    )  # fmt: skip
+    )
 
 
-def view_of(camera: Camera, pose: WorldPose, name: str, known: bool, noise: float, random) -> View:  # type: ignore[no-untyped-def]
+def view_of(camera: Camera, pose: WorldPose, name: str, known: bool, noise: float, random) -> View:
     world = pose.origin + BOARD @ pose.rotation[:, :2].T
     return View(
         name, name, BOARD, camera.project(world) + random.normal(0, noise, BOARD.shape), pose if known else None
@@ -187,9 +191,13 @@ def test_a_real_lens_is_told_from_an_orthographic_one(random: np.random.Generato
     """At 1 m a marker 10 mm off its plane is 0.64 mm wrong at 64 mm off-axis; the pinhole model is exact."""
     square = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
     near = PinholeCamera(
-        image_size=SIZE, rotation_vector=tuple(Rotation.from_matrix(square).as_rotvec()), focal=(9810.0, 9800.0),
-        centre=(639.5, 359.5), translation=(-0.05, 0.02, 1.0), distortion=(-0.3, 1.0, 0.0, 0.0, 0.0),
-    )  # fmt: skip
+        image_size=SIZE,
+        rotation_vector=tuple(Rotation.from_matrix(square).as_rotvec()),
+        focal=(9810.0, 9800.0),
+        centre=(639.5, 359.5),
+        translation=(-0.05, 0.02, 1.0),
+        distortion=(-0.3, 1.0, 0.0, 0.0, 0.0),
+    )
     solution = solve_one(views_of(near, random))
     nearness, sigma = solution.nearness["left"]
     assert nearness == pytest.approx(1.0, abs=0.05)

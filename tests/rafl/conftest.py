@@ -23,10 +23,18 @@ def dataset(small_specimen: Specimen) -> Dataset:
     seen = markers.positions(torch.from_numpy(let_go(simulator, starts, FRAMES, tuple(LOADS)))).numpy()
     trajectories = {
         name: Trajectory(
-            0.01 * np.arange(FRAMES), seen[:, k], np.ones((FRAMES, 20), dtype=bool),
-            np.full((FRAMES, 20, 3), 1e-5), starts[k], nodes, nodes, nodes, nodes[:, 0], SPLITS[name],
+            0.01 * np.arange(FRAMES),
+            seen[:, k],
+            np.ones((FRAMES, 20), dtype=bool),
+            np.full((FRAMES, 20, 3), 1e-5),
+            starts[k],
+            nodes,
+            nodes,
+            nodes,
+            nodes[:, 0],
+            SPLITS[name],
             {"load_g": 1e3 * load},
         )
         for k, (name, load) in enumerate(LOADS.items())
-    }  # fmt: skip
+    }
     return Dataset("small", small_specimen.simulator(0.01), markers, trajectories, "by a test")

@@ -79,13 +79,13 @@ class Barred:
 @pytest.mark.parametrize("down", [False, True])
 def test_a_bar_that_passes_takes_no_names_with_it(down: bool) -> None:
     """It hides two of seven columns or one of four rows at a time; where it cuts a dot, sigma says so."""
-    free = follow(Barred(), lambda: None)  # type: ignore[arg-type]
+    free = follow(Barred(), lambda: None)
     ends, half = ((0, 2046), 260) if down else ((-200, 1500), 200)
     middle = np.linspace(*ends, 160).astype(int)
     bars = [slice(max(at - half, 0), max(at + half, 0)) for at in middle]
     everywhere = slice(None)
     video = Barred(tuple((bar, everywhere) if down else (everywhere, bar) for bar in bars))
-    tracks = follow(video, lambda: None)  # type: ignore[arg-type]
+    tracks = follow(video, lambda: None)
     order = np.linalg.norm(free.start[:, None] - tracks.start, axis=2).argmin(axis=1)
     assert sorted(order) == list(range(28))
     error = np.abs(tracks.pixel[:, order] - free.pixel)
@@ -98,7 +98,7 @@ def test_a_bar_that_passes_takes_no_names_with_it(down: bool) -> None:
 
 def test_sigma_knows_what_compression_does_to_it(tmp_path: Path) -> None:
     """Coded again by H.264, it is off from where it was by as much as sigma says."""
-    before = follow(Barred(), lambda: None)  # type: ignore[arg-type]
+    before = follow(Barred(), lambda: None)
     path = tmp_path / "a.mkv"
     pictures = [frame.picture for frame in Barred().frames() if frame.picture is not None]
     write_video(path, "libx264", "yuv420p", options={"crf": "23"}, pictures=pictures)

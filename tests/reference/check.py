@@ -121,9 +121,11 @@ def residual_field(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
     force = field.on(simulator)(q, v, none)
     by_q, by_v, *by_weights = torch.autograd.grad((force * torch.tensor(data["c"])).sum(), [q, v, *weights])
     for what, ours, theirs in (
-        ("features", values[0], data["features"]), ("force", force[0], data["force"]),
-        ("d_q", by_q[0], data["d_q"]), ("d_v", by_v[0], data["d_v"]),
-    ):  # fmt: skip
+        ("features", values[0], data["features"]),
+        ("force", force[0], data["force"]),
+        ("d_q", by_q[0], data["d_q"]),
+        ("d_v", by_v[0], data["d_v"]),
+    ):
         difference = np.abs(ours.detach().numpy() - theirs).max()
         yield Deviation(what, float(difference / np.abs(theirs).max()), FIELD_LIMIT, "relative")
     rest = torch.from_numpy(mesh.vertices)[None]

@@ -27,9 +27,11 @@ def camera(face: str, turn: list[float], scale: float = 7.3e3) -> OrthographicCa
     rotation = Rotation.from_rotvec(np.radians(turn)).as_matrix() @ SQUARE[face]
     middle = scale * rotation[:2] @ [0.05, 0.015, 0.015]
     return OrthographicCamera(
-        image_size=SIZE, scale=(scale, scale), rotation_vector=tuple(Rotation.from_matrix(rotation).as_rotvec()),
+        image_size=SIZE,
+        scale=(scale, scale),
+        rotation_vector=tuple(Rotation.from_matrix(rotation).as_rotvec()),
         offset=(480.0 - middle[0], 200.0 - middle[1]),
-    )  # fmt: skip
+    )
 
 
 def film(path: Path, truth: OrthographicCamera, face: str, shift: float = 0.0) -> None:

@@ -64,9 +64,7 @@ class Family:
 
 
 @njit(cache=True)
-def _admitted(  # type: ignore[no-untyped-def]
-    usual_radius, usual_contrast, usual_shade, radius, vague, flattening, parameters, misfit, used, sigma
-):
+def _admitted(usual_radius, usual_contrast, usual_shade, radius, vague, flattening, parameters, misfit, used, sigma):
     good = np.empty(len(radius), np.bool_)
     for k in range(len(radius)):
         contrast, level = parameters[k, 8], parameters[k, 9]
@@ -134,7 +132,7 @@ def lines_through(place: NDArray, members: NDArray, most: float = np.inf) -> int
 
 
 @njit(cache=True)
-def breadth_of(rest):  # type: ignore[no-untyped-def]
+def breadth_of(rest):
     """How far apart the lines of markers (M, 2) are.
 
     The usual distance to the nearest that is not in line with the nearest.

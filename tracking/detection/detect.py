@@ -102,13 +102,13 @@ class Dots:
 
 
 @njit(cache=True)
-def shade_of(contrast, level):  # type: ignore[no-untyped-def]
+def shade_of(contrast, level):
     """See `Dots.shade`; of one dot or of several."""
     return np.abs(contrast) / np.maximum(np.maximum(level, level + contrast), 1.0)
 
 
 @njit(cache=True, nogil=True)
-def _fit_some(image, start, first, last, wary, fitted, figures):  # type: ignore[no-untyped-def]
+def _fit_some(image, start, first, last, wary, fitted, figures):
     """Fit starts first to last of start (D, 12); fills fitted (D, 12) and figures (D, FIGURES)."""
     count = start.shape[0]
     room = np.empty(SCRATCH, np.float32)
@@ -130,7 +130,7 @@ def _fit_some(image, start, first, last, wary, fitted, figures):  # type: ignore
 
 
 @njit(cache=True, nogil=True)
-def _describe(p, quality, figures):  # type: ignore[no-untyped-def]
+def _describe(p, quality, figures):
     """Fills what `Dots` says of one fit.
 
     In order: sigma (2), leverage (2), radius, flattening, residual, used, vague, misfit, grain.
@@ -252,7 +252,7 @@ def _blobs(image: NDArray[np.uint8], count: int, labels: NDArray[np.int32], scal
 
 
 @njit(cache=True, nogil=True)
-def _extents(labels, count):  # type: ignore[no-untyped-def]
+def _extents(labels, count):
     """What labelled blobs cover.
 
     Left, top and first pixel beyond right and bottom (L, 4), area (L), centroid (L, 2) and covariance of its pixels'

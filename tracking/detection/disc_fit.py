@@ -42,7 +42,7 @@ LONG_SMEAR = 0.4  # of the radius: motion during the exposure that a blurred edg
 
 
 @njit(**FAST)
-def _reweight(p, instants, x0, y0, count, strange, share, w):  # type: ignore[no-untyped-def]
+def _reweight(p, instants, x0, y0, count, strange, share, w):
     """Less weight to pixels far off, by the median of the residuals' size; returns the largest change.
 
     At the outline by the median there: a dot drawn by hand is nowhere quite a disc. None at all to pixels that show
@@ -68,7 +68,7 @@ def _reweight(p, instants, x0, y0, count, strange, share, w):  # type: ignore[no
 
 
 @njit(**FAST)
-def _usual_size(most, count, w):  # type: ignore[no-untyped-def]
+def _usual_size(most, count, w):
     """A standard deviation by the median of the residuals at the outline, where `most` is 0, or at all pixels (1)."""
     count = min(count, LARGEST)
     found = 0
@@ -79,7 +79,7 @@ def _usual_size(most, count, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _widen(reach, count, w):  # type: ignore[no-untyped-def]
+def _widen(reach, count, w):
     """Takes all weight by the level shown from pixels within reach [px] of those that have little."""
     count = min(count, LARGEST)
     square = np.float32(reach * reach)
@@ -97,7 +97,7 @@ def _widen(reach, count, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def fit_disc(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
+def fit_disc(image, p, near, wary, w, quality):
     """Fit a disc from the start p (12), which is filled with the result, as is quality (QUALITY).
 
     near (K, 3): centre and radius of other dots. wary: of pixels that the start does not explain. w (SCRATCH), float32,
@@ -110,7 +110,7 @@ def fit_disc(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _fit(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
+def _fit(image, p, near, wary, w, quality):
     """One try of `fit_disc`; True where it fails and some pixels were distrusted."""
     n = PARAMETERS
     quality[:] = 0.0
@@ -163,7 +163,7 @@ def _fit(image, p, near, wary, w, quality):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _distrust(p, x0, y0, count, wary, w, H):  # type: ignore[no-untyped-def]
+def _distrust(p, x0, y0, count, wary, w, H):
     """First weights: little where a level is far from the start's, at the outline from all between; whether any is.
 
     Otherwise a highlight beside the dot could pass for its blurred edge. Also returns how far is far, as a share of the
@@ -187,7 +187,7 @@ def _distrust(p, x0, y0, count, wary, w, H):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _relight(p, x0, y0, count, strange, w, H):  # type: ignore[no-untyped-def]
+def _relight(p, x0, y0, count, strange, w, H):
     """Gives a start the light of the picture, where that explains most of what is strange; returns how much is left.
 
     Light brightens a dot and its surroundings by the same factor; what shows something else than the dot does not.
@@ -211,7 +211,7 @@ def _relight(p, x0, y0, count, strange, w, H):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _weigh_start(p, x0, y0, count, share, w, H):  # type: ignore[no-untyped-def]
+def _weigh_start(p, x0, y0, count, share, w, H):
     """Weights by the levels that a start expects; returns how many are small. Fills H as `normal_equations` does."""
     strange = 0
     H[:] = 0.0
@@ -224,7 +224,7 @@ def _weigh_start(p, x0, y0, count, share, w, H):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _noise(row, count, w):  # type: ignore[no-untyped-def]
+def _noise(row, count, w):
     """The standard deviation of what pixels side by side in a line do not share, by the median of its size."""
     count = min(count, LARGEST)
     found = 0
@@ -236,7 +236,7 @@ def _noise(row, count, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _grain(count, w):  # type: ignore[no-untyped-def]
+def _grain(count, w):
     """The variance of what the residuals of pixels side by side in a line do not share, as they are trusted."""
     count = min(count, LARGEST)
     square, pairs = np.float32(0.0), np.float32(0.0)
@@ -249,7 +249,7 @@ def _grain(count, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**AS_WRITTEN)
-def _weigh_levels(first, count, contrast, share, w):  # type: ignore[no-untyped-def]
+def _weigh_levels(first, count, contrast, share, w):
     """Fills a linearised chunk's weights by the levels shown, and which are flat; returns how many are small.
 
     share: of the contrast: a level this far from what is expected gets half of the weight.
@@ -276,7 +276,7 @@ def _weigh_levels(first, count, contrast, share, w):  # type: ignore[no-untyped-
 
 
 @njit(**FAST)
-def _count_beyond(most, count, w):  # type: ignore[no-untyped-def]
+def _count_beyond(most, count, w):
     """How many residuals are larger; a sum becomes vector instructions, a maximum would not."""
     count = min(count, LARGEST)
     limit = np.float32(most)

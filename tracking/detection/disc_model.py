@@ -49,7 +49,7 @@ FAST: dict[str, Any] = {
 
 
 @njit(**FAST)
-def choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
+def choose_pixels(image, p, near, w):
     """The pixels a fit looks at, relative to the rounded centre; returns how many.
 
     Where the disc's level or its surroundings' is flat every other pixel is enough.
@@ -106,7 +106,7 @@ def choose_pixels(image, p, near, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _without(near, x0, y0, count, w):  # type: ignore[no-untyped-def]
+def _without(near, x0, y0, count, w):
     """Leaves out other dots' pixels; returns how many stay."""
     for other in range(near.shape[0]):
         x, y, square = near[other, 0] - x0, near[other, 1] - y0, (near[other, 2] + 3.0) ** 2
@@ -119,13 +119,13 @@ def _without(near, x0, y0, count, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def filled_up(count):  # type: ignore[no-untyped-def]
+def filled_up(count):
     """So many pixels and those that fill them up to a multiple of `LANES`."""
     return (count + LANES - 1) // LANES * LANES
 
 
 @njit(**FAST)
-def linearise(p, instants, x0, y0, first, count, w):  # type: ignore[no-untyped-def]
+def linearise(p, instants, x0, y0, first, count, w):
     """Derivatives of a chunk's pixels, from the `first`, by the parameters, and the residual.
 
     A disc that moves far while the shutter is open is a mean over several instants; p[5:8] are then the
@@ -244,13 +244,13 @@ def linearise(p, instants, x0, y0, first, count, w):  # type: ignore[no-untyped-
 
 
 @njit(**FAST)
-def instants_of(p):  # type: ignore[no-untyped-def]
+def instants_of(p):
     """How many instants resolve the way p[6:8] moved during the exposure, and a little more."""
     return min(4 + int(np.hypot(p[6], p[7]) / (1.2 * np.sqrt(p[5]))), 32)
 
 
 @njit(**FAST)
-def smear(p):  # type: ignore[no-untyped-def]
+def smear(p):
     """Exchanges W, of a long smear, for an edge and a way moved: a box of length m has variance m^2 / 12."""
     mean = 0.5 * (p[5] + p[7])
     spread = np.sqrt(0.25 * (p[5] - p[7]) ** 2 + p[6] * p[6])

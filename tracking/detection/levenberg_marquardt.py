@@ -44,7 +44,7 @@ BLOCK = 4  # px: errors closer than this are not taken to be independent
 
 
 @njit(**FAST)
-def _keep_possible(p, instants):  # type: ignore[no-untyped-def]
+def _keep_possible(p, instants):
     """Keeps W's variances within bounds and its off-diagonal below what makes it indefinite."""
     widest = max(MOST_BLUR, LONGEST / max(p[2] * p[4] - p[3] * p[3], 1e-12))
     p[5] = min(max(p[5], LEAST_BLUR), widest)
@@ -56,7 +56,7 @@ def _keep_possible(p, instants):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _is_close(p, step):  # type: ignore[no-untyped-def]
+def _is_close(p, step):
     """Whether a step from p leaves the normal matrix nearly as it was."""
     swelling = max(abs(step[2]), abs(step[4])) / (p[2] * p[4] - p[3] * p[3])
     change = max(abs(step[8] / p[8]), 0.5 * (abs(step[5]) + abs(step[7])) / (p[5] + p[7]))
@@ -64,7 +64,7 @@ def _is_close(p, step):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _assess(p, instants, x0, y0, count, w, L, quality):  # type: ignore[no-untyped-def]
+def _assess(p, instants, x0, y0, count, w, L, quality):
     """Fills quality and takes a small step by the factor at hand; returns its length, the cost before it and the gain.
 
     Variances as independent errors of the residual's size give them, and as the scores summed over blocks
@@ -113,7 +113,7 @@ def _assess(p, instants, x0, y0, count, w, L, quality):  # type: ignore[no-untyp
 
 
 @njit(**FAST)
-def _number_blocks(count, w):  # type: ignore[no-untyped-def]
+def _number_blocks(count, w):
     """Fills in which block of a square of them each pixel lies; returns how many blocks the square's side has."""
     count = min(filled_up(count), LARGEST)
     most = 0  # a maximum of whole numbers becomes vector instructions, one of floats does not
@@ -128,7 +128,7 @@ def _number_blocks(count, w):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def _add_influence(first, count, w, pull, white, blocks, doubted):  # type: ignore[no-untyped-def]
+def _add_influence(first, count, w, pull, white, blocks, doubted):
     """Each pixel's weight in the centre, squared, and times its residual, summed by block and over doubted ones."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
@@ -159,13 +159,13 @@ def _add_influence(first, count, w, pull, white, blocks, doubted):  # type: igno
 
 
 @njit(**FAST)
-def _is_last(length, gain, cost, count):  # type: ignore[no-untyped-def]
+def _is_last(length, gain, cost, count):
     """Whether the step after this one would not be worth its while."""
     return (length < SETTLED and gain < WORTH * cost) or gain * count < WORTHLESS * cost
 
 
 @njit(**FAST)
-def minimise(p, instants, x0, y0, count, w, H, L, quality):  # type: ignore[no-untyped-def]
+def minimise(p, instants, x0, y0, count, w, H, L, quality):
     """Levenberg and Marquardt's steps from p, which is filled with the result, as is quality; False where they fail.
 
     H holds the normal equations at p. A step that leaves the normal matrix nearly as it was is followed by another with

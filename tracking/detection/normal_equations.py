@@ -16,7 +16,7 @@ from rafl.tracking.detection.disc_model import (
 
 
 @njit(**FAST)
-def normal_equations(p, instants, x0, y0, count, w, H):  # type: ignore[no-untyped-def]
+def normal_equations(p, instants, x0, y0, count, w, H):
     """Fills H (13, 13), lower triangle: J W J^T; its last row ends in the weighted squared residual."""
     H[:] = 0.0
     for first in range(0, count, CHUNK):
@@ -26,7 +26,7 @@ def normal_equations(p, instants, x0, y0, count, w, H):  # type: ignore[no-untyp
 
 
 @njit(**FAST)
-def add_products(first, count, w, H):  # type: ignore[no-untyped-def]
+def add_products(first, count, w, H):
     """Adds a chunk of linearised pixels to H (13, 13)."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
@@ -68,7 +68,7 @@ def add_products(first, count, w, H):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def add_scores(first, count, w, score):  # type: ignore[no-untyped-def]
+def add_scores(first, count, w, score):
     """Adds a chunk of linearised pixels to score (12), J W r; returns its squared residual and its weight."""
     count = min(count, CHUNK)
     first = min(max(first, 0), LARGEST - CHUNK)
@@ -88,7 +88,7 @@ def add_scores(first, count, w, score):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def factorise(H, damping, L):  # type: ignore[no-untyped-def]
+def factorise(H, damping, L):
     """L L^T = H + damping diag H, L's diagonal as reciprocals; False where that is not positive definite."""
     for j in range(PARAMETERS):
         for i in range(j, PARAMETERS):
@@ -107,7 +107,7 @@ def factorise(H, damping, L):  # type: ignore[no-untyped-def]
 
 
 @njit(**FAST)
-def substitute(L, x):  # type: ignore[no-untyped-def]
+def substitute(L, x):
     """x becomes (L L^T)^-1 x."""
     for i in range(PARAMETERS):  # by columns: each step's products do not wait for one another
         x[i] *= L[i, i]

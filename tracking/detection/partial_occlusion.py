@@ -45,8 +45,15 @@ class Outlines:
         """
         widths, change, least = np.empty((3, len(dots), 2))
         alike = _compare(
-            dots.parameters, dots.sigma, dots.vague, self._usual, self._scatter, widths, change, least,
-        )  # fmt: skip
+            dots.parameters,
+            dots.sigma,
+            dots.vague,
+            self._usual,
+            self._scatter,
+            widths,
+            change,
+            least,
+        )
         own, hidden = change, np.zeros(len(dots), bool)
         if not alike:
             known = np.isfinite(change[:, 0])
@@ -67,7 +74,7 @@ class Outlines:
 
 
 @njit(cache=True, error_model="numpy")
-def _half_widths(parameters):  # type: ignore[no-untyped-def]
+def _half_widths(parameters):
     """Logarithms of half widths along x and y of discs (D, 12), (D, 2)."""
     widths = np.empty((len(parameters), 2))
     for k in range(len(parameters)):
@@ -78,7 +85,7 @@ def _half_widths(parameters):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _compare(parameters, sigma, vague, usual, scatter, widths, change, least):  # type: ignore[no-untyped-def]
+def _compare(parameters, sigma, vague, usual, scatter, widths, change, least):
     """Fills the half widths, their changes and what change is least counted, (M, 2), NaN where a dot is not seen.
 
     Returns whether none changed by more.
@@ -97,7 +104,7 @@ def _compare(parameters, sigma, vague, usual, scatter, widths, change, least):  
 
 
 @njit(cache=True)
-def _learn(widths, change, own, hidden, usual, scatter, looks):  # type: ignore[no-untyped-def]
+def _learn(widths, change, own, hidden, usual, scatter, looks):
     """Takes a picture's changes (M, 2), as they are and but for what all share, into what is usual."""
     known = change[:, 0] == change[:, 0]
     both = known & ~hidden

@@ -153,7 +153,7 @@ def _half_seen(dots: Dots, size: Array) -> Dots:
 
 
 @njit(cache=True, error_model="numpy")
-def _cut(parameters, height, width):  # type: ignore[no-untyped-def]
+def _cut(parameters, height, width):
     """Which discs (D, 12) reach beyond a picture's edge, with their blur, (D)."""
     cut = np.zeros(len(parameters), np.bool_)
     for k in range(len(parameters)):

@@ -84,9 +84,15 @@ class Newcomers:
     _first: NDArray | None = None  # picture
 
     def look(
-        self, number: int, image: NDArray, place: Array, seen: NDArray[np.bool_], marks: NDArray[np.bool_],
-        pattern: Pattern, parameters: Array,
-    ) -> list[Newcomer]:  # fmt: skip
+        self,
+        number: int,
+        image: NDArray,
+        place: Array,
+        seen: NDArray[np.bool_],
+        marks: NDArray[np.bool_],
+        pattern: Pattern,
+        parameters: Array,
+    ) -> list[Newcomer]:
         """Markers that have become known.
 
         Args:

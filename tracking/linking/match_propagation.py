@@ -15,7 +15,7 @@ AMBIGUOUS = 0.75  # of a marker: a match that explains less than so much less ma
 
 
 @njit(cache=True, nogil=True)
-def _predicted(marker, shape, linear, spacing, neighbours, dots, match):  # type: ignore[no-untyped-def]
+def _predicted(marker, shape, linear, spacing, neighbours, dots, match):
     """Where a marker's matched neighbours put it: their affine map, drawn towards the expected one."""
     sw = sx = sy = tx = ty = 0.0  # sums over neighbours, places taken from the marker's own
     mxx = mxy = myy = nxx = nxy = nyx = nyy = 0.0
@@ -65,7 +65,7 @@ def _predicted(marker, shape, linear, spacing, neighbours, dots, match):  # type
 
 
 @njit(cache=True, nogil=True)
-def _nearest_free(x, y, gate, dots, taken, buckets, cell, origin):  # type: ignore[no-untyped-def]
+def _nearest_free(x, y, gate, dots, taken, buckets, cell, origin):
     """The nearest dot not taken within the gate of (x, y), -1 for none."""
     found = -1
     nearest = gate
@@ -84,7 +84,7 @@ def _nearest_free(x, y, gate, dots, taken, buckets, cell, origin):  # type: igno
 
 
 @njit(cache=True, nogil=True)
-def _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match):  # type: ignore[no-untyped-def]
+def _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match):
     """Gives up matches that their neighbours contradict, and looks again for markers that found none."""
     for _ in range(2):
         for marker in range(shape.shape[0]):
@@ -111,7 +111,7 @@ def _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, tak
 
 
 @njit(cache=True, nogil=True)
-def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, sure, seed, match):  # type: ignore[no-untyped-def]
+def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, sure, seed, match):
     """Spread the match of a seed, one marker and one dot, and of sure ones (M), -1 for none; fills match (M) likewise.
 
     Returns the match's score; a marker counts up to 1 + steady (M) where it is expected. buckets (R, C, B): dots by
@@ -167,9 +167,9 @@ def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, ori
 
 
 @njit(cache=True, nogil=True)
-def best_growth(  # type: ignore[no-untyped-def]
+def best_growth(
     shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, seeds, enough, best
-):  # fmt: skip
+):
     """Tries seeds (S, 2) of marker and dot until a score reaches `enough`; fills best (M)."""
     match, nobody = np.empty(shape.shape[0], np.int64), np.full(shape.shape[0], -1)
     highest = -np.inf
@@ -178,9 +178,21 @@ def best_growth(  # type: ignore[no-untyped-def]
         if highest > -np.inf and best[seeds[s, 0]] == seeds[s, 1]:
             continue
         score = _grow(
-            shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, nobody, seeds[s],
+            shape,
+            expected,
+            linear,
+            spacing,
+            neighbours,
+            dots,
+            buckets,
+            cell,
+            origin,
+            far,
+            steady,
+            nobody,
+            seeds[s],
             match,
-        )  # fmt: skip
+        )
         if score > highest:
             highest = score
             best[:] = match
@@ -190,9 +202,9 @@ def best_growth(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def agreed_growth(  # type: ignore[no-untyped-def]
+def agreed_growth(
     shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, sure, seeds, best
-):  # fmt: skip
+):
     """Which markers have the same dot in best (M) and in all matches that grow from seeds and sure ones as well."""
     agreed = best >= 0
     match = np.empty(shape.shape[0], np.int64)
@@ -206,9 +218,21 @@ def agreed_growth(  # type: ignore[no-untyped-def]
         if best[marker] == dot or sure[marker] >= 0:
             continue
         other = _grow(
-            shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, sure, seeds[s],
+            shape,
+            expected,
+            linear,
+            spacing,
+            neighbours,
+            dots,
+            buckets,
+            cell,
+            origin,
+            far,
+            steady,
+            sure,
+            seeds[s],
             match,
-        )  # fmt: skip
+        )
         if other > score - AMBIGUOUS:
             agreed &= match == best
     return agreed

@@ -52,9 +52,17 @@ class Pattern:
 
 
 def recognise(
-    pattern: Pattern, shape: Array, expected: Array, trusted: Array, dots: Array, reach: float, sureness: float,
-    steady: Array, seen: NDArray[np.bool_] | None = None, marks: NDArray[np.bool_] | None = None,
-) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:  # fmt: skip
+    pattern: Pattern,
+    shape: Array,
+    expected: Array,
+    trusted: Array,
+    dots: Array,
+    reach: float,
+    sureness: float,
+    steady: Array,
+    seen: NDArray[np.bool_] | None = None,
+    marks: NDArray[np.bool_] | None = None,
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """The dot of each marker, (M), -1 for none, and of which markers it can be no other's, (M).
 
     Args:
@@ -80,9 +88,16 @@ def recognise(
         agreed = match >= 0
         body, free = np.flatnonzero(~marks), np.setdiff1d(np.arange(len(dots)), match)
         found, alone = recognise(
-            Pattern.of(pattern.rest[body]), shape[body], expected[body], trusted[body], dots[free], reach, sureness,
-            steady[body], seen[body],
-        )  # fmt: skip
+            Pattern.of(pattern.rest[body]),
+            shape[body],
+            expected[body],
+            trusted[body],
+            dots[free],
+            reach,
+            sureness,
+            steady[body],
+            seen[body],
+        )
         match[body[found >= 0]] = free[found[found >= 0]]
         agreed[body] = alone
         return match, agreed
@@ -114,9 +129,15 @@ def _at_place(pattern: Pattern, shape: Array, dots: Array, most: float) -> NDArr
 
 
 def _with_marks(
-    pattern: Pattern, shape: Array, expected: Array, trusted: Array, dots: Array, reach: float, far: float,
+    pattern: Pattern,
+    shape: Array,
+    expected: Array,
+    trusted: Array,
+    dots: Array,
+    reach: float,
+    far: float,
     steady: Array,
-) -> tuple[NDArray[np.int64], float]:  # fmt: skip
+) -> tuple[NDArray[np.int64], float]:
     """The best match (M) in which whoever can keep its place does, as marks on the frame would, and its score."""
     match = _at_place(pattern, shape, dots, STILL)
     moving, free = np.flatnonzero(match < 0), np.setdiff1d(np.arange(len(dots)), match)
@@ -126,9 +147,13 @@ def _with_marks(
     body, own = Pattern.of(pattern.rest[moving]), expected[moving]
     search = _Search.of(body, dots[free])
     grown, score = search.grow(
-        shape[moving], own, _local_maps(body, shape[moving], own), far, steady[moving],
+        shape[moving],
+        own,
+        _local_maps(body, shape[moving], own),
+        far,
+        steady[moving],
         search.seeds(own, trusted[moving], reach),
-    )  # fmt: skip
+    )
     match[moving[grown >= 0]] = free[grown[grown >= 0]]
     return match, marks + score
 
@@ -188,24 +213,55 @@ class _Search:
         match = np.full(len(shape), -1)
         enough = 0.97 * float(np.sort(1.0 + steady)[-min(len(shape), len(self.dots)) :].sum())
         score = best_growth(
-            shape, expected, linear, self.pattern.spacing, self.pattern.neighbours, self.dots, self.buckets, self.cell,
-            self.origin, far, steady, seeds, enough, match,
-        )  # fmt: skip
+            shape,
+            expected,
+            linear,
+            self.pattern.spacing,
+            self.pattern.neighbours,
+            self.dots,
+            self.buckets,
+            self.cell,
+            self.origin,
+            far,
+            steady,
+            seeds,
+            enough,
+            match,
+        )
         return match, score
 
     def agreed(
-        self, shape: Array, linear: Array, expected: Array, far: float, steady: Array, sure: NDArray[np.int64],
-        seeds: NDArray[np.int64], best: NDArray[np.int64],
-    ) -> NDArray[np.bool_]:  # fmt: skip
+        self,
+        shape: Array,
+        linear: Array,
+        expected: Array,
+        far: float,
+        steady: Array,
+        sure: NDArray[np.int64],
+        seeds: NDArray[np.int64],
+        best: NDArray[np.int64],
+    ) -> NDArray[np.bool_]:
         """Which markers have their dot in every match that explains about as much and keeps the sure ones, (M)."""
         unsure = np.setdiff1d(best, sure)
         if not len(unsure):
             return best >= 0
         asked = unsure[np.linspace(0, len(unsure) - 1, min(len(unsure), QUESTIONED)).astype(int)]
         return agreed_growth(
-            shape, expected, linear, self.pattern.spacing, self.pattern.neighbours, self.dots, self.buckets, self.cell,
-            self.origin, far, steady, sure, seeds[np.isin(seeds[:, 1], asked)], best,
-        )  # fmt: skip
+            shape,
+            expected,
+            linear,
+            self.pattern.spacing,
+            self.pattern.neighbours,
+            self.dots,
+            self.buckets,
+            self.cell,
+            self.origin,
+            far,
+            steady,
+            sure,
+            seeds[np.isin(seeds[:, 1], asked)],
+            best,
+        )
 
 
 def _local_maps(pattern: Pattern, shape: Array, expected: Array) -> Array:

@@ -62,7 +62,7 @@ class Motion:
 
 
 @njit(cache=True)
-def _extrapolated(places, count, order, swing):  # type: ignore[no-untyped-def]
+def _extrapolated(places, count, order, swing):
     """The markers' next places, (M, 2), by a prediction of some order, or the highest that so few pictures allow.
 
     A free oscillation's acceleration falls by stiffness times velocity; one number serves all markers.
@@ -82,7 +82,7 @@ def _extrapolated(places, count, order, swing):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _judge(places, count, swing, found, known, spacing, surprise):  # type: ignore[no-untyped-def]
+def _judge(places, count, swing, found, known, spacing, surprise):
     """Puts into surprise (4) the root mean square miss of each order, or a fading memory of a larger one."""
     for order in range(min(count, ORDERS)):
         expected = _extrapolated(places, count, order, swing)
@@ -96,7 +96,7 @@ def _judge(places, count, swing, found, known, spacing, surprise):  # type: igno
 
 
 @njit(cache=True)
-def _remembered(places, count, swing, place):  # type: ignore[no-untyped-def]
+def _remembered(places, count, swing, place):
     """The last places with the new ones (M, 2) among them; what they say of the oscillation goes into swing (2)."""
     result = np.empty_like(places)
     result[:-1] = places[1:]

@@ -54,7 +54,7 @@ class Marks:
 
 
 @njit(cache=True)
-def _go(place, seen, rest, spacing, way):  # type: ignore[no-untyped-def]
+def _go(place, seen, rest, spacing, way):
     """The farthest that a marker is from its first place [spacings]; way (M) becomes at least what each one's is."""
     farthest = 0.0
     for k in range(len(seen)):

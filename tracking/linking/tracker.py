@@ -220,9 +220,17 @@ class Tracker:
             steady[self.missing == 0] = 1.0 - surprise / CALM
         reach = SEED_REACH * uncertain
         match, agreed = recognise(
-            self.pattern, self.motion.last, expected, trusted, dots.centre, reach, sureness, steady, self._anchors(),
+            self.pattern,
+            self.motion.last,
+            expected,
+            trusted,
+            dots.centre,
+            reach,
+            sureness,
+            steady,
+            self._anchors(),
             self.marks.known,
-        )  # fmt: skip
+        )
         body = (match >= 0) & ~self.marks.known
         if agreed.sum() < ENOUGH * (~self.marks.known).sum():
             agreed = (match >= 0) & self._anchors()
@@ -297,7 +305,7 @@ def _replaced(dots: Dots, rows: NDArray[np.int64], others: Dots) -> Dots:
 
 
 @njit(cache=True)
-def _own(parameters, before, expected, sought, spacing, same, good):  # type: ignore[no-untyped-def]
+def _own(parameters, before, expected, sought, spacing, same, good):
     """Leaves in good (M) the markers whose own dots these are; False where too few lie near their expected places.
 
     before: parameters in the picture before. sought: who of the body is likely there. same: distance below which two

@@ -100,7 +100,7 @@ def delays(rig: Rig, pixels: dict[str, CameraPixels], times: dict[str, Array]) -
     return result
 
 
-def _disagreement(rig, pixels, times, first, other, both):  # type: ignore[no-untyped-def]
+def _disagreement(rig, pixels, times, first, other, both):
     """Root mean square reprojection residual [px] as a function of the other camera's delay [s]."""
     mine = CameraPixels(pixels[first].pixel[:, both], pixels[first].sigma[:, both])
     theirs = CameraPixels(pixels[other].pixel[:, both], pixels[other].sigma[:, both])
@@ -122,7 +122,7 @@ def _disagreement(rig, pixels, times, first, other, both):  # type: ignore[no-un
     return cost
 
 
-def _unlikeness(pixels, times, first, other):  # type: ignore[no-untyped-def]
+def _unlikeness(pixels, times, first, other):
     """The share of one view's motion that the other's does not explain, as a function of the delay [s]."""
 
     def motion(item: CameraPixels, modes: int) -> Array:

@@ -14,7 +14,7 @@ def rest_lame(mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @njit(**KERNEL)
-def derivatives(w, mu, lam):  # type: ignore[no-untyped-def]
+def derivatives(w, mu, lam):
     """Energy density and its derivatives at the scratch's stretches; see `rafl.fem.kernel_layout`."""
     for g in range(8):
         e0 = w[STRETCH * 8 + g] - 1.0

@@ -18,7 +18,7 @@ def rest_lame(mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
 
 
 @njit(**KERNEL)
-def derivatives(w, mu, lam):  # type: ignore[no-untyped-def]
+def derivatives(w, mu, lam):
     """Energy density and its derivatives at the scratch's stretches; see `rafl.fem.kernel_layout`."""
     bulk = mu + lam
     for g in range(8):

@@ -69,7 +69,7 @@ def plain_derivatives(s: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tenso
 
 
 @njit(**KERNEL)
-def _roots(s, kappa, plus, p):  # type: ignore[no-untyped-def]
+def _roots(s, kappa, plus, p):
     """Solve p_i + kappa / p_i = s_i for p (3); the last by its minus branch unless `plus`.
 
     Returns sum log p_i.
@@ -86,7 +86,7 @@ def _roots(s, kappa, plus, p):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def volume_projection(s, p):  # type: ignore[no-untyped-def]
+def volume_projection(s, p):
     """Fill p (3), the positive triple of product 1 nearest to the stretches s (3), the smallest last.
 
     The multiplier kappa of the constraint satisfies p_i + kappa / p_i = s_i and is returned.
@@ -134,13 +134,13 @@ def volume_projection(s, p):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _projected(stretch, kappa):  # type: ignore[no-untyped-def]
+def _projected(stretch, kappa):
     """The larger root p of p (p - stretch) = -kappa."""
     return 0.5 * (stretch + np.sqrt(stretch * stretch - 4.0 * kappa))
 
 
 @njit(**KERNEL)
-def derivatives(w, mu, lam):  # type: ignore[no-untyped-def]
+def derivatives(w, mu, lam):
     """Energy density and its derivatives at the scratch's stretches; see `rafl.fem.kernel_layout`.
 
     kappa comes from a few Newton steps on all lanes; a lane that they do not bring to
@@ -219,7 +219,7 @@ def derivatives(w, mu, lam):  # type: ignore[no-untyped-def]
 
 
 @njit(**KERNEL)
-def _lane(w, mu, lam, g):  # type: ignore[no-untyped-def]
+def _lane(w, mu, lam, g):
     s = np.empty(3)
     p = np.empty(3)
     d = np.empty(3)

@@ -33,7 +33,7 @@ def truth(small_specimen: Specimen) -> np.ndarray:
 
 
 def build(specimen: Specimen, folder: Path, settings: CaptureSettings = SETTINGS, **row: object) -> Dataset:
-    rows = [RecordingRow(recording="q0", load_g=60, split="train", **row)]  # type: ignore[arg-type]
+    rows = [RecordingRow(recording="q0", load_g=60, split="train", **row)]
     return build_dataset(specimen, folder, rows, settings, "", lambda: None)
 
 
@@ -173,8 +173,22 @@ def track(specimen: Specimen, folder: Path, position: np.ndarray, sigma: np.ndar
     """Write q0.h5, every marker seen."""
     time, state = 0.01 * np.arange(FRAMES), np.ones(position.shape[:2], dtype=np.uint8)
     tracks = Tracks(
-        specimen.layout.names, time, position, sigma, state, {}, {}, {}, {}, {}, {}, 100.0, "", {"v.mp4": "0"}, "",
-    )  # fmt: skip
+        specimen.layout.names,
+        time,
+        position,
+        sigma,
+        state,
+        {},
+        {},
+        {},
+        {},
+        {},
+        {},
+        100.0,
+        "",
+        {"v.mp4": "0"},
+        "",
+    )
     write_tracks(folder / "q0.h5", tracks)
 
 

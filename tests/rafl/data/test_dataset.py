@@ -160,7 +160,7 @@ def test_parts_that_do_not_fit_are_neither_written_nor_read(
     dataset: Dataset, tmp_path: Path, key: str, value: object, message: str
 ) -> None:
     path = tmp_path / "a.h5"
-    bad = replace(dataset, trajectories={"a": replace(dataset.trajectories["a"], **{key: value})})  # type: ignore[arg-type]
+    bad = replace(dataset, trajectories={"a": replace(dataset.trajectories["a"], **{key: value})})
     with pytest.raises(ValueError, match=message):
         write_dataset(path, bad)
     assert not path.exists()

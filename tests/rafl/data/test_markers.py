@@ -11,14 +11,12 @@ from rafl.fem.mesh import HexMesh
 MESH = HexMesh.box((4, 2, 2), (0.08, 0.04, 0.04))
 
 
-def tied(*points: tuple[float, float, float]):  # type: ignore[no-untyped-def]
+def tied(*points: tuple[float, float, float]):
     return embed(MESH, tuple(f"m{i}" for i in range(len(points))), np.array(points, dtype=float))
 
 
 @settings(deadline=None, max_examples=30)
-@given(
-    st.floats(0.0, 0.08), st.floats(0.0, 0.04), st.lists(st.floats(-0.5, 0.5), min_size=9, max_size=9)
-)  # fmt: skip
+@given(st.floats(0.0, 0.08), st.floats(0.0, 0.04), st.lists(st.floats(-0.5, 0.5), min_size=9, max_size=9))
 def test_points_on_the_skin_follow_any_affine_motion(x: float, z: float, entries: list[float]) -> None:
     markers = tied((x, 0.0, z))
     assert markers.weights.sum() == pytest.approx(1.0)

@@ -250,11 +250,15 @@ def test_a_material_that_explains_all_is_kept(dataset: Dataset, tmp_path: Path) 
 def test_trading_off_is_said() -> None:
     table = pd.DataFrame(
         {
-            "name": ["youngs_modulus", "poissons_ratio"], "unit": ["Pa", np.nan], "value": [2e5, 0.45],
-            "low_95": [1.9e5, np.nan], "high_95": [2.1e5, np.nan],
-            "correlation_youngs_modulus": [1.0, -0.97], "correlation_poissons_ratio": [-0.97, 1.0],
+            "name": ["youngs_modulus", "poissons_ratio"],
+            "unit": ["Pa", np.nan],
+            "value": [2e5, 0.45],
+            "low_95": [1.9e5, np.nan],
+            "high_95": [2.1e5, np.nan],
+            "correlation_youngs_modulus": [1.0, -0.97],
+            "correlation_poissons_ratio": [-0.97, 1.0],
         }
-    )  # fmt: skip
+    )
     first, second, third = spoken(table)
     assert "1.9e+05 to 2.1e+05" in first
     assert "no interval" in second

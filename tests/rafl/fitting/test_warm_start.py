@@ -47,10 +47,14 @@ def test_a_twist_keeps_sections_plane_and_turns_the_tip() -> None:
 
 def test_the_lesson_needs_no_simulation_and_helps(seen: Dataset, tmp_path: Path) -> None:
     """Of every vertex, of some of them, and where mass damping acts too."""
-    few = replace(seen, markers=seen.markers.some(np.arange(6, 45, 4)), trajectories={
-        name: replace(item, **{key: getattr(item, key)[:, 6:45:4] for key in ("markers", "valid", "sigma")})
-        for name, item in seen.trajectories.items()
-    })  # fmt: skip
+    few = replace(
+        seen,
+        markers=seen.markers.some(np.arange(6, 45, 4)),
+        trajectories={
+            name: replace(item, **{key: getattr(item, key)[:, 6:45:4] for key in ("markers", "valid", "sigma")})
+            for name, item in seen.trajectories.items()
+        },
+    )
     damped = replace(seen, simulator=replace(BASE, material=replace(BASE.material, mass_damping=2.0)))
     for number, dataset in enumerate((seen, few, damped)):
         torch.manual_seed(2)

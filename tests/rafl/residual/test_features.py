@@ -66,11 +66,18 @@ def test_features_of_a_known_motion(mesh: HexMesh) -> None:
     axial = np.array([W[2, 1], W[0, 2], W[1, 0]])
     expected = np.concatenate(
         [
-            [-0.1, 0.0, 0.1], (A.T @ A - np.eye(3)).ravel(), [0.99 - 1.0], np.diag(D), [np.trace(D)],
-            dev.ravel(), [np.sqrt(0.5 * (dev**2).sum())], axial, [2 * np.linalg.norm(axial)],
+            [-0.1, 0.0, 0.1],
+            (A.T @ A - np.eye(3)).ravel(),
+            [0.99 - 1.0],
+            np.diag(D),
+            [np.trace(D)],
+            dev.ravel(),
+            [np.sqrt(0.5 * (dev**2).sum())],
+            axial,
+            [2 * np.linalg.norm(axial)],
             R.T @ G.numpy(),
         ]
-    )  # fmt: skip
+    )
     np.testing.assert_allclose(one, expected, atol=1e-12)
 
 

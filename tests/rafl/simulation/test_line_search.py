@@ -25,9 +25,23 @@ def _tried(starts, steps, old):
     slope = (steps * residual).sum(axis=1)
     trial = moved(q, rows, FREE, steps, np.ones(batch))
     again = judge(
-        trial, *_elastic(trial), rows, old, np.ones(batch), slope, FREE, inertia, none, none, *limits,
-        q, energy, residual, largest, ready,
-    )  # fmt: skip
+        trial,
+        *_elastic(trial),
+        rows,
+        old,
+        np.ones(batch),
+        slope,
+        FREE,
+        inertia,
+        none,
+        none,
+        *limits,
+        q,
+        energy,
+        residual,
+        largest,
+        ready,
+    )
     np.testing.assert_allclose(largest, np.abs(residual).max(axis=1))
     return q, residual, ready, again
 

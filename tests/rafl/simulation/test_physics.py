@@ -174,12 +174,12 @@ def skfem_tip_deflection(cells: int, nu: float, total: float) -> float:
     mu, lam = MODULUS / (2 * (1 + nu)), MODULUS * nu / ((1 + nu) * (1 - 2 * nu))
 
     @skfem.BilinearForm
-    def stiffness(u, v, w):  # type: ignore[no-untyped-def]
+    def stiffness(u, v, w):
         strain = sym_grad(u)
         return ddot(2 * mu * strain + lam * eye(trace(strain), 3), sym_grad(v))
 
     @skfem.LinearForm
-    def load(v, w):  # type: ignore[no-untyped-def]
+    def load(v, w):
         return total / SIDE**2 * v[2]
 
     face = basis.boundary(mesh.facets_satisfying(lambda x: np.isclose(x[0], LENGTH)))
@@ -303,7 +303,7 @@ def test_viscosity_does_not_brake_rigid_turning() -> None:
     energies = {}
     for kind, value in (("none", 0.0), ("viscosity", 500.0), ("stiffness_damping", 5e-3)):
         values = {} if kind == "none" else {kind: value}
-        material = Material(law="corotated", mass="lumped", **values)  # type: ignore[arg-type]
+        material = Material(law="corotated", mass="lumped", **values)
         simulator = Simulator(mesh, material, FREE, 2e-3, NO_GRAVITY, "generalised-alpha")
         q, _ = rollout(simulator, start_of(mesh.vertices, v), 60)
         speed = (q[-1] - q[-3])[0].numpy() / 4e-3

@@ -20,7 +20,7 @@ INTEGRATORS = ("implicit-euler", "generalised-alpha")
 
 def simulator_of(integrator: str = "implicit-euler", **values: object) -> Simulator:
     settings = {"mass": "lumped", "law": "projective", "youngs_modulus": 1e5, "poissons_ratio": 0.4}
-    return Simulator(MESH, Material(**(settings | values)), FIXED, integrator=integrator)  # type: ignore[arg-type]
+    return Simulator(MESH, Material(**(settings | values)), FIXED, integrator=integrator)
 
 
 def start_of(q: Tensor, v: Tensor | None = None, force: Tensor | None = None) -> Start:
@@ -45,9 +45,19 @@ def state(name: str, random: np.random.Generator) -> np.ndarray:
 
 # What each input is multiplied by, so that a change of 1e-6 is well above the solver's tolerance.
 SCALE = {
-    "q": 1e-2, "v": 1.0, "force": 1e-1, "youngs_modulus": 1e4, "poissons_ratio": 0.1, "density": 1e3, "gravity": 10.0,
-    "mass_damping": 1.0, "stiffness_damping": 1e-2, "viscosity": 100.0, "clamp": 1e-2, "added_mass": 1e-3,
-}  # fmt: skip
+    "q": 1e-2,
+    "v": 1.0,
+    "force": 1e-1,
+    "youngs_modulus": 1e4,
+    "poissons_ratio": 0.1,
+    "density": 1e3,
+    "gravity": 10.0,
+    "mass_damping": 1.0,
+    "stiffness_damping": 1e-2,
+    "viscosity": 100.0,
+    "clamp": 1e-2,
+    "added_mass": 1e-3,
+}
 
 
 def inputs(q: np.ndarray, damped: bool, random: np.random.Generator, steps: int) -> dict[str, Tensor]:

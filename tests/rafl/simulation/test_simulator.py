@@ -13,7 +13,7 @@ from rafl.simulation.simulator import Simulator
 
 def beam(**keywords: object) -> Simulator:
     mesh = HexMesh.box((4, 2, 2), (0.08, 0.03, 0.03))
-    return Simulator(mesh, Material(mass="lumped"), mesh.face_nodes("x-min"), **keywords)  # type: ignore[arg-type]
+    return Simulator(mesh, Material(mass="lumped"), mesh.face_nodes("x-min"), **keywords)
 
 
 def test_solve_tangent_inverts_the_slope_of_the_gradient(random: np.random.Generator) -> None:
@@ -135,7 +135,7 @@ def test_unknown_settings_are_refused(keywords: dict[str, object], expected: str
 )
 def test_unknown_materials_are_refused(values: dict[str, object]) -> None:
     with pytest.raises(ValueError, match="expected"):
-        Material(**values)  # type: ignore[arg-type]
+        Material(**values)
 
 
 def test_a_twisted_beam_does_not_snap_inside_out() -> None:

@@ -39,8 +39,9 @@ def test_noise_errors_reach_the_bound_and_sigma_says_so() -> None:
         random = np.random.default_rng(seed)
         truth = [
             (x + random.uniform(-2, 2), y + random.uniform(-2, 2), 8.0, 8.0, 0.0)
-            for x in (30, 80, 130, 170) for y in (30, 80, 130)
-        ]  # fmt: skip
+            for x in (30, 80, 130, 170)
+            for y in (30, 80, 130)
+        ]
         dots = all_dots(picture(truth, noise=4.0, seed=seed), True)
         assert len(dots) == len(truth)
         for x, y, *_ in truth:

@@ -89,9 +89,15 @@ def test_small_blurred_dots_are_fitted(noise: float, least: float) -> None:
 
 @pytest.mark.parametrize(
     ("radius", "noise", "smear", "limit"),
-    [(3.0, 4.0, (0.0, 0.0), 1.15), (8.0, 8.0, (0.0, 0.0), 1.15), (20.0, 4.0, (0.0, 0.0), 1.15),
-     (8.0, 4.0, (3.0, 2.0), 1.15), (8.0, 4.0, (0.0, 16.0), 1.4), (20.0, 4.0, (20.0, 14.0), 2.2)],
-)  # fmt: skip
+    [
+        (3.0, 4.0, (0.0, 0.0), 1.15),
+        (8.0, 8.0, (0.0, 0.0), 1.15),
+        (20.0, 4.0, (0.0, 0.0), 1.15),
+        (8.0, 4.0, (3.0, 2.0), 1.15),
+        (8.0, 4.0, (0.0, 16.0), 1.4),
+        (20.0, 4.0, (20.0, 14.0), 2.2),
+    ],
+)
 def test_centres_reach_the_noise_limit(radius: float, noise: float, smear: tuple[float, float], limit: float) -> None:
     """Against the Cramer-Rao bound with all but the place known, and sigma says what the error is."""
     scene = Scene(size=(int(4 * radius) + 40, int(4 * radius) + 40), noise=noise)

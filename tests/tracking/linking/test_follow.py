@@ -56,7 +56,7 @@ def order(tracks_start: np.ndarray, truth: np.ndarray) -> np.ndarray:
 def test_small_dots_out_of_focus_are_followed(radius: float, blur: float) -> None:
     """Whose radius, contrast and blur cannot be told apart: all are found in the first picture and kept."""
     truth = bent(grid(), 20.0 * np.cos(2 * np.pi * np.arange(16) / 7.3))
-    tracks = follow(Drawn(truth, radius=radius, blur=blur, noise=4.0), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth, radius=radius, blur=blur, noise=4.0), lambda: None)
     assert tracks.pixel.shape == truth.shape
     found = tracks.pixel[:, order(tracks.start, truth[0])]
     assert np.isfinite(found).mean() > 0.97
@@ -67,7 +67,7 @@ def test_small_dots_out_of_focus_are_followed(radius: float, blur: float) -> Non
 def test_dim_dots_in_noise_are_followed(radius: float, noise: float) -> None:
     """Of a contrast four or five times the pixels' noise, by how much a disc's residual is of no account."""
     truth = bent(grid(), 20.0 * np.cos(2 * np.pi * np.arange(24) / 7.3))
-    tracks = follow(Drawn(truth, radius=radius, noise=noise, contrast=40.0), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth, radius=radius, noise=noise, contrast=40.0), lambda: None)
     assert tracks.pixel.shape == truth.shape
     named = order(tracks.start, truth[0])
     error = tracks.pixel[:, named] - truth
@@ -88,7 +88,7 @@ def flicker(frame: int) -> np.ndarray:
 @pytest.mark.parametrize("light", [shadow, flicker])
 def test_dots_are_followed_in_changing_light(light: Callable[[int], np.ndarray]) -> None:
     truth = bent(grid(), 20.0 * np.cos(2 * np.pi * np.arange(24) / 7.3))
-    tracks = follow(Drawn(truth, light=light), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth, light=light), lambda: None)
     assert tracks.pixel.shape == truth.shape
     found = tracks.pixel[:, order(tracks.start, truth[0])]
     assert np.isfinite(found).all()
@@ -100,7 +100,7 @@ def test_no_dot_changes_its_identity(swing: float) -> None:
     """Up to `swing` px of tip motion, up to three quarters of a spacing a frame, in a pattern of equal dots."""
     rest = grid()
     truth = bent(rest, swing * np.cos(2 * np.pi * np.arange(24) / 7.3))
-    tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth), lambda: None)
     assert tracks.pixel.shape == truth.shape
     found = tracks.pixel[:, order(tracks.start, truth[0])]
     assert np.isfinite(found).mean() > 0.99
@@ -113,7 +113,7 @@ def test_marks_on_the_frame_keep_their_names_beside_a_fast_body(turn: float, hei
     swinging = bent(grid(), 34.0 * np.sin(2 * np.pi * np.arange(24) / 6.3 + np.pi * turn)) - np.array([0.0, 5.0])
     marks = np.stack([30.0 + 44.0 * np.arange(6), np.full(6, height)], axis=1)
     truth = np.concatenate([swinging, np.tile(marks, (24, 1, 1))], axis=1)
-    tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth), lambda: None)
     found = tracks.pixel[:, order(tracks.start, truth[0])]
     assert np.isfinite(found).mean() > 0.99
     assert np.nanmax(np.linalg.norm(found - truth, axis=2)) < 0.3
@@ -122,7 +122,7 @@ def test_marks_on_the_frame_keep_their_names_beside_a_fast_body(turn: float, hei
 def test_hidden_dots_come_back_under_their_names() -> None:
     rest = grid()
     truth = bent(rest, 15.0 * np.sin(2 * np.pi * np.arange(20) / 16))
-    tracks = follow(Drawn(truth, hidden=tuple(range(6, 12))), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth, hidden=tuple(range(6, 12))), lambda: None)
     found = tracks.pixel[:, order(tracks.start, truth[0])]
     assert np.isnan(found[6:12, :3]).all()
     assert np.abs(found[12:] - truth[12:]).max() < 0.3
@@ -142,7 +142,7 @@ def test_who_comes_back_into_a_curl_is_not_taken_for_its_neighbour() -> None:
     truth += np.array([180.0, 20.0])
     behind = truth[..., 1] > np.median(truth[..., 1])
     behind[0] = False
-    tracks = follow(Drawn(np.where(behind[..., None], np.nan, truth)), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(np.where(behind[..., None], np.nan, truth)), lambda: None)
     away = np.linalg.norm(tracks.pixel[:, order(tracks.start, truth[0])] - truth, axis=2)
     assert np.nanmax(away) < 0.5
     assert np.isfinite(away[~behind]).mean() > 0.65
@@ -158,7 +158,7 @@ def test_a_bar_that_passes_takes_no_names_with_it() -> None:
     behind = np.abs(truth[..., 0] - bar[:, None]) < 80.0
     behind[0] = False
     assert behind.sum(axis=1).max() == 15
-    tracks = follow(Drawn(np.where(behind[..., None], np.nan, truth)), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(np.where(behind[..., None], np.nan, truth)), lambda: None)
     away = np.linalg.norm(tracks.pixel[:, order(tracks.start, truth[0])] - truth, axis=2)
     assert np.nanmax(away) < 0.3
     assert np.isfinite(away[~behind]).mean() > 0.99
@@ -170,7 +170,7 @@ def test_dots_hidden_at_first_are_taken_in() -> None:
     rest = grid()
     rest = np.concatenate([rest[[4, 13, 23]], np.delete(rest, [4, 13, 23], axis=0)])
     truth = bent(rest, np.concatenate([np.zeros(15), 20.0 * np.sin(2 * np.pi * np.arange(55) / 16)]))
-    tracks = follow(Drawn(truth, hidden=tuple(range(15))), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth, hidden=tuple(range(15))), lambda: None)
     assert tracks.late == 3
     assert tracks.pixel.shape == truth.shape
     match = order(tracks.start, truth[0])
@@ -186,7 +186,7 @@ def test_hidden_columns_far_apart_are_taken_in() -> None:
     truth = bent(rest, np.concatenate([np.zeros(15), 20.0 * np.sin(2 * np.pi * np.arange(85) / 16)]))
     places = truth.copy()
     places[:15, rest[:, 0] > 180.0] = np.nan
-    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(places), lambda: None)
     assert tracks.late == 6
     match = order(tracks.start, truth[0])
     assert sorted(match) == list(range(15))
@@ -200,7 +200,7 @@ def test_dots_hidden_at_first_beside_the_clamp_are_taken_in(tip: float) -> None:
     truth = bent(grid(), tip * np.cos(0.4 * np.arange(90)))
     places = truth.copy()
     places[:20, truth[0, :, 0] < 130.0] = np.nan
-    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(places), lambda: None)
     assert tracks.late == 9
     match = order(tracks.start, truth[0])
     assert sorted(match) == list(range(24))
@@ -216,7 +216,7 @@ def test_a_dot_put_by_hand_beside_the_clamp_is_taken_in(seed: int) -> None:
     truth = bent(rest, 2.4 * np.cos(0.4 * np.arange(90)))
     places = truth.copy()
     places[:20, 1] = np.nan
-    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(places), lambda: None)
     assert tracks.late == 1
     assert np.linalg.norm(tracks.start[-1] - truth[0, 1]) < 1.0
 
@@ -229,7 +229,7 @@ def test_a_tip_hidden_at_first_is_put_where_it_was(speed: float) -> None:
     places = truth.copy()
     places[:15, 6:] = np.nan
     places[:40, 12:] = np.nan
-    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(places), lambda: None)
     assert tracks.late == 8
     match = order(tracks.start, truth[0])
     assert sorted(match) == list(range(14))
@@ -244,7 +244,7 @@ def test_a_fast_tip_hidden_at_first_is_known_again_from_look_to_look(speed: floa
     truth = np.array([curled(0.2 * np.cos(speed * frame)) for frame in range(90)]) + np.array([60.0, 118.0])
     places = truth.copy()
     places[:20, 8:] = np.nan
-    tracks = follow(Drawn(places), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(places), lambda: None)
     assert tracks.late == 6
     match = order(tracks.start, truth[0])
     assert sorted(match) == list(range(14))
@@ -262,7 +262,7 @@ def test_a_swarm_of_dots_that_stand_still_is_not_taken_in(seed: int) -> None:
         others = np.concatenate([truth.reshape(-1, 2), blots])
         if np.linalg.norm(others - blot, axis=1).min() > 16.0:
             blots = np.concatenate([blots, blot[None]])
-    tracks = follow(Drawn(truth, blots=tuple(map(tuple, blots))), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth, blots=tuple(map(tuple, blots))), lambda: None)
     assert tracks.late == 0
     assert np.isfinite(tracks.pixel).mean() > 0.99
     assert np.nanmax(np.linalg.norm(tracks.pixel[:, order(tracks.start, truth[0])] - truth, axis=2)) < 0.3
@@ -273,7 +273,7 @@ def test_what_stands_still_behind_the_body_is_not_taken_in(period: int) -> None:
     """Nor where the swinging body comes back to it again and again, or leaves it slowly."""
     truth = bent(grid(), 20.0 * np.sin(2 * np.pi * np.arange(100) / period))
     blots = ((20.0, 40.0), (160.0, 40.0), (330.0, 100.0), (330.0, 180.0), (100.0, 195.0), (220.0, 210.0))
-    tracks = follow(Drawn(truth, blots=blots), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth, blots=blots), lambda: None)
     assert tracks.late == 0
 
 
@@ -284,13 +284,13 @@ def test_what_shakes_with_the_camera_beside_the_clamp_is_not_taken_in(seed: int)
     blots = np.tile([[12.0, 55.0], [10.0, 100.0], [16.0, 135.0], [30.0, 215.0], [50.0, 30.0]], (80, 1, 1))
     blots[:5] = np.nan
     shake = np.random.default_rng(seed).normal(0.0, 0.45, (80, 1, 2))
-    tracks = follow(Drawn(np.concatenate([truth, blots], axis=1) + shake), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(np.concatenate([truth, blots], axis=1) + shake), lambda: None)
     assert tracks.late == 0
 
 
 def test_frames_before_the_first_that_shows_dots_are_missing() -> None:
     truth = np.concatenate([np.full((4, 24, 2), np.nan), np.repeat(grid()[None], 3, axis=0)])
-    tracks = follow(Drawn(truth), lambda: None)  # type: ignore[arg-type]
+    tracks = follow(Drawn(truth), lambda: None)
     assert np.isnan(tracks.pixel[:4]).all()
     assert not tracks.damaged.any()
     assert np.abs(tracks.pixel[4:, order(tracks.start, truth[4])] - truth[4:]).max() < 0.3
@@ -298,4 +298,4 @@ def test_frames_before_the_first_that_shows_dots_are_missing() -> None:
 
 def test_too_few_dots_are_refused() -> None:
     with pytest.raises(InputError, match=r"drawn\.mp4: expected at least 3 dots .* found 2"):
-        follow(Drawn(grid(2, 1)[None]), lambda: None)  # type: ignore[arg-type]
+        follow(Drawn(grid(2, 1)[None]), lambda: None)

@@ -9,9 +9,12 @@ from rafl.tracking.reconstruction.triangulation import CameraPixels, at_times, t
 from rafl.common.errors import InputError
 
 SIDE = OrthographicCamera(
-    image_size=(1280, 720), scale=(6000.0, 6000.0), rotation_vector=(np.pi / 2, 0.0, 0.0), offset=(600.0, 400.0),
+    image_size=(1280, 720),
+    scale=(6000.0, 6000.0),
+    rotation_vector=(np.pi / 2, 0.0, 0.0),
+    offset=(600.0, 400.0),
     plane=Plane((0.0, -1.0, 0.0), -0.01, 5e-4),
-)  # fmt: skip
+)
 ABOVE = replace(SIDE, rotation_vector=(np.pi, 0.0, 0.0), plane=None, distortion=(5e-3, 0.0))
 
 
@@ -107,9 +110,13 @@ def test_two_cameras_that_disagree_count_as_not_seen(random: np.random.Generator
 
 def test_pinhole_and_orthographic_cameras_together(random: np.random.Generator) -> None:
     near = PinholeCamera(
-        image_size=(1280, 720), rotation_vector=(np.pi, 0.0, 0.0), focal=(6000.0, 6010.0), centre=(600.0, 400.0),
-        translation=(0.01, 0.02, 1.0), distortion=(-0.1, 0.02, 1e-3, -1e-3, 0.0),
-    )  # fmt: skip
+        image_size=(1280, 720),
+        rotation_vector=(np.pi, 0.0, 0.0),
+        focal=(6000.0, 6010.0),
+        centre=(600.0, 400.0),
+        translation=(0.01, 0.02, 1.0),
+        distortion=(-0.1, 0.02, 1e-3, -1e-3, 0.0),
+    )
     points = random.uniform(-0.03, 0.03, (5, 3, 3))
     rig = Rig({"side": SIDE, "near": near})
     position, sigma, _ = triangulate(rig, {name: seen(camera, points) for name, camera in rig.cameras.items()})

@@ -235,7 +235,7 @@ def test_another_stream_that_seems_to_begin_amid_a_file_is_passed_over() -> None
                 yield item
 
     notes: list[str] = []
-    assert list(packets_of(Container(), None, notes)) == [1, 2, 3]  # type: ignore[arg-type]
+    assert list(packets_of(Container(), None, notes)) == [1, 2, 3]
     assert not notes
 
 

@@ -126,7 +126,7 @@ def test_reading_can_stop_while_decoders_are_at_work(tmp_path: Path, monkeypatch
     running = threading.active_count()
     reading = frames_of_file(tmp_path / "a.avi", 0, 0.0, [])
     next(reading)
-    reading.close()  # type: ignore[attr-defined]
+    reading.close()
     assert threading.active_count() == running
 
 
@@ -313,5 +313,5 @@ def test_a_reader_that_stops_early_leaves_no_thread(tmp_path: Path) -> None:
     before = threading.active_count()
     frames = iter(open_video(tmp_path / "a.mkv").read())
     next(frames)
-    frames.close()  # type: ignore[attr-defined]
+    frames.close()
     assert threading.active_count() == before
