@@ -28,7 +28,7 @@ _forget_stale_kernels()
 
 # Imports what commands need once; each of them is a fork of that.
 COMMANDS = multiprocessing.get_context("forkserver")
-COMMANDS.set_forkserver_preload(["support", "rafl.capture.cli", "rafl.cli", "rafl.tracking.cli"])
+COMMANDS.set_forkserver_preload(["support", "rafl.capture.commands", "rafl.commands", "rafl.tracking.commands"])
 
 SMALL = """format: rafl-specimen/1
 name: small

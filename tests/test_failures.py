@@ -99,7 +99,7 @@ def test_who_is_stopped_gives_up_what_runs_and_what_waits(lab: Path, monkeypatch
             tick()
             time.sleep(0.01)
 
-    monkeypatch.setattr("rafl.tracking.cli.track_recording", endless)
+    monkeypatch.setattr("rafl.tracking.commands.track_recording", endless)
     before = signal.signal(signal.SIGINT, signal.default_int_handler)  # who runs in a shell's background ignores it
     try:
         result = CliRunner().invoke(track_app, command(lab))

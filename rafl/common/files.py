@@ -75,6 +75,19 @@ def require_file(path: Path, what: str) -> Path:
     return path
 
 
+def require_folder(path: Path, what: str) -> Path:
+    """Return `path` if it is a folder.
+
+    Raises:
+        InputError: nothing, or a file, is there; the message says that `what` was expected.
+    """
+    if not path.exists():
+        raise InputError(f"expected {what} at {path}, found nothing there; check the path")
+    if not path.is_dir():
+        raise InputError(f"expected {what} at {path}, found a file; name the folder")
+    return path
+
+
 def sha256(path: Path) -> str:
     """SHA-256 of a file's content; of a folder's files one after another, by name."""
     digest = hashlib.sha256()

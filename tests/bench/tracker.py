@@ -21,11 +21,12 @@ from following import filling, hiding, linking, speed
 from footage import Row
 from geometry import calibrating, reconstructing
 from localisation import localisation
-from rafl.tracking.cli import SOON
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 from threadpoolctl import threadpool_limits
+
+from rafl.tracking.commands import THREAD_SWITCH_S
 
 warnings.filterwarnings("ignore")
 logging.getLogger("trackpy").setLevel(logging.ERROR)
@@ -54,7 +55,7 @@ def main() -> None:
         parser.error(f"expected --only of {', '.join(SECTIONS)}, found {', '.join(sorted(unknown))}")
     cv2.setNumThreads(1)  # as the command does
     threadpool_limits(1, user_api="blas")
-    sys.setswitchinterval(SOON)
+    sys.setswitchinterval(THREAD_SWITCH_S)
     print(f"seed {options.seed}")
     rows: list[tuple[str, Row]] = []
     for section in options.only.split(","):

@@ -1,0 +1,155 @@
+"""What `rafl-render` and `rafl-capture` do once their options are checked: call the library, print and write."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import typer
+from rich.console import Console
+
+from rafl.capture.dataset.build import CaptureSettings, build_dataset
+from rafl.capture.dataset.summary import print_page, recordings_table, warnings
+from rafl.capture.dataset.table import RecordingRow, read_recording_rows
+from rafl.capture.registration.registration import RestPose as RestPose
+from rafl.capture.rendering.film import ENCODINGS, film, side_cameras, write_board_images, write_truth
+from rafl.capture.rendering.motion import Motion, tip_load_release, twist_release
+from rafl.capture.rendering.render import Look, Painter
+from rafl.capture.report import write_dataset_report
+from rafl.capture.specimen.specimen import Specimen, read_specimen
+from rafl.common.command_line import progress
+from rafl.common.errors import InputError, SimulationError
+from rafl.common.files import write_text
+from rafl.common.kernels import announce_compilation
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import damaged_parts, update_dataset, write_dataset
+
+DRAWN_MM = 2.0  # largest distance from the skin of the mesh at which a marker is drawn [mm]
+
+
+@dataclass(frozen=True)
+class TrueMaterial:
+    """The material that rendered recordings have.
+
+    Attributes:
+        youngs_modulus: [Pa].
+        poissons_ratio: dimensionless.
+    """
+
+    youngs_modulus: float
+    poissons_ratio: float
+
+
+def appearance(dot_mm: float, blur_px: float, exposure: float, noise: float, background: str) -> Look:
+    """How frames look: dot diameter [mm], sigma of the blur [px], exposure [frame times], noise [grey levels]."""
+    return Look(0.5e-3 * dot_mm, blur_px, exposure, noise, background)
+
+
+def render(
+    specimen: Path,
+    out: Path,
+    loads_g: list[float],
+    twists_deg: list[float],
+    frames: int,
+    fps: float,
+    true: TrueMaterial,
+    look: Look,
+    codec: str,
+    seed: int,
+) -> None:
+    """Simulate the releases and write videos, board images, recordings.csv and truth.h5.
+
+    Raises:
+        InputError: the specimen cannot be read, its markers cannot be drawn, or a motion cannot be simulated.
+    """
+    announce_compilation()
+    described = read_specimen(specimen)
+    described.markers(1e-3 * DRAWN_MM, "or choose smaller elements: dots are drawn on the skin of the elements")
+    material = replace(described.material, youngs_modulus=true.youngs_modulus, poissons_ratio=true.poissons_ratio)
+    with progress() as bar:
+        task = bar.add_task("simulating", total=len(loads_g) + len(twists_deg))
+        motions: list[Motion] = []
+        try:
+            for load in loads_g:
+                motions.append(tip_load_release(described, material, 1e-3 * load, frames, fps))
+                bar.advance(task)
+            for twist in twists_deg:
+                motions.append(twist_release(described, material, np.radians(twist), frames, fps))
+                bar.advance(task)
+        except SimulationError as error:
+            raise InputError(f"the motion cannot be simulated: {error}") from None
+        random = np.random.default_rng(seed)
+        rig = side_cameras(described, motions, random)
+        write_board_images(out / "calibration", rig, look, random)
+        painters = {name: Painter.of(described, camera, look, random) for name, camera in rig.cameras.items()}
+        task = bar.add_task("rendering", total=frames * len(motions) * len(painters))
+        for number, motion in enumerate(motions):
+            for view, (name, painter) in enumerate(painters.items()):
+                path = out / "videos" / motion.name / f"{name}.{ENCODINGS[codec].suffix}"
+                film(path, motion, painter, fps, codec, seed + 97 * number + view, lambda: bar.advance(task))
+    truth = f"E = {true.youngs_modulus} Pa, nu = {true.poissons_ratio}, density = {material.density} kg/m^3"
+    write_truth(out / "truth.h5", described, motions, rig, truth)
+    write_text(out / "recordings.csv", _recordings_csv(motions))
+    typer.echo(f"wrote {out}/ (videos/, calibration/, recordings.csv, truth.h5)")
+    typer.echo(f"next: rafl-calibrate {out}/calibration --out {out}/calib.yaml")
+
+
+def _recordings_csv(motions: list[Motion]) -> str:
+    """The table of recordings: about 60 % train, the rest val and test."""
+    pattern = ("train", "test", "train", "val", "train", "test")
+    rows = [f"{m.name},{1e3 * m.load:g},{pattern[i % len(pattern)]}" for i, m in enumerate(motions)]
+    return "\n".join(["recording,load_g,split", *rows, ""])
+
+
+def capture(
+    specimen: Path, tracks: Path, recordings: Path, out: Path | None, update: bool, settings: CaptureSettings
+) -> None:
+    """Build a dataset from tracks and a table of recordings; print a table and write a report beside it.
+
+    Raises:
+        InputError: a file cannot be read, or a recording does not fit the specimen.
+    """
+    torch.set_num_threads(1)  # the element kernels have the other cores
+    announce_compilation()
+    described = read_specimen(specimen)
+    rows = read_recording_rows(recordings, complete=not update)
+    path = out or Path("datasets") / f"{described.name}.h5"
+    dataset = _built(described, tracks, rows, settings, recordings)
+    (update_dataset if update else write_dataset)(path, dataset)
+    report = path.with_suffix(".html")
+    write_dataset_report(report, described, dataset)
+    Console(width=130).print(recordings_table(dataset))
+    for line in warnings(dataset):
+        typer.echo(line, err=True)
+    typer.echo(f"wrote {path} and {report}")
+    typer.echo(f"next: rafl-fit {path}")
+
+
+def _built(
+    specimen: Specimen, tracks: Path, rows: list[RecordingRow], settings: CaptureSettings, recordings: Path
+) -> Dataset:
+    recipe = f"{specimen.text}\n# recordings.csv\n{recordings.read_text(encoding='utf-8')}"
+    with progress() as bar:
+        task = bar.add_task("fitting first frames", total=len(rows))
+        try:
+            return build_dataset(specimen, tracks, rows, settings, recipe, lambda: bar.advance(task))
+        except SimulationError as error:
+            raise InputError(f"{error}; does the first frame show the specimen at rest?") from None
+
+
+def inspect(contents: Path | None, verify: Path | None) -> None:
+    """Print the contents of one dataset, and compare another with its hashes.
+
+    Raises:
+        InputError: a dataset cannot be read, or differs from its hashes.
+    """
+    if contents is not None:
+        print_page(contents, Console(width=130, soft_wrap=True))
+    if verify is not None:
+        damaged = damaged_parts(verify)
+        if damaged:
+            raise InputError(
+                f"expected {verify} as it was written, found {', '.join(damaged)} changed; build it again, or fetch "
+                "another copy"
+            )
+        typer.echo(f"{verify}: all parts are as they were written")

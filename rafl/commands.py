@@ -1,0 +1,241 @@
+"""What `rafl-fit` and `rafl-eval` do once their options are checked: call the library, print and write the results."""
+
+from collections import Counter
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch
+import typer
+from rich.console import Console
+from rich.progress import Progress, TaskID
+from rich.table import Table
+
+from rafl.common.command_line import progress
+from rafl.common.errors import InputError, SimulationError
+from rafl.common.files import write_text
+from rafl.common.kernels import announce_compilation
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import read_dataset
+from rafl.evaluation.metrics import (
+    Comparison,
+    Transfer,
+    compare_those_that_simulate,
+    error_table,
+    held_out_errors,
+    latex_table,
+    motion_table,
+    split_table,
+)
+from rafl.evaluation.report import write_report
+from rafl.fitting.distributed import rank
+from rafl.fitting.fit import fit as fit_model
+from rafl.fitting.methods import EPOCHS
+from rafl.fitting.run_folder import FittedModel, load_model
+from rafl.fitting.sysid import spoken
+from rafl.fitting.train_field import Report
+
+TORCH_THREADS = 1  # the network is small; the other cores run the element kernels
+
+
+def fit(
+    paths: list[Path], out: Path | None, method: str, tensorboard: bool, resume: bool, options: dict[str, Any]
+) -> None:
+    """Train a model, print its progress, and say what was written.
+
+    Args:
+        paths: dataset files to train on.
+        out: run folder; None for runs/DATASET-METHOD.
+        method: one of `rafl.fitting.methods.METHODS`.
+        tensorboard: whether to write the history for TensorBoard too.
+        resume: whether to continue the run in the folder.
+        options: further keyword arguments of `rafl.fit`.
+
+    Raises:
+        InputError: the datasets, the run folder or the options do not fit the method.
+        typer.Exit: a simulation failed; code 1.
+    """
+    torch.set_num_threads(TORCH_THREADS)
+    announce_compilation()
+    run = out or Path("runs") / f"{read_dataset(paths[0]).name}-{method}"
+    first = rank() == 0  # of the processes that torchrun started
+    writer = _open_writer(run) if tensorboard and first else None
+    with progress() as bar:
+        task = bar.add_task("epoch", total=options["epochs"] or EPOCHS[method])
+        report = _epoch_report(bar, task, writer, first)
+        notify = partial(typer.echo, err=True)
+        try:
+            model = fit_model(paths, run, method, resume=resume, report=report, notify=notify, **options)
+        except SimulationError as error:
+            raise _failed_simulation(error) from None
+    if not first:
+        return
+    typer.echo(_describe(model))
+    if (run / "parameters.csv").exists():
+        for line in spoken(pd.read_csv(run / "parameters.csv")):
+            typer.echo(line)
+    typer.echo(f"wrote {run}/ (model.pt, history.csv, config.yaml)")
+    typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in paths)}")
+
+
+def _epoch_report(bar: Progress, task: TaskID, writer: Any, first: bool) -> Report:
+    """A function that prints one row of the history and passes it to TensorBoard."""
+
+    def report(row: dict[str, float]) -> None:
+        kind = "epoch" if "epoch" in row else "warm_start"
+        bar.update(task, completed=row.get("epoch", 0))
+        if not first:
+            return
+        values = ", ".join(f"{key} {value:.5g}" for key, value in row.items() if key != kind)
+        label = "epoch" if kind == "epoch" else "pre-training"
+        bar.console.print(f"{label} {row[kind]:3.0f}: {values}", highlight=False, soft_wrap=True)
+        if writer is not None:
+            for key, value in row.items():
+                writer.add_scalar(f"{kind}/{key}", value, int(row[kind]))
+            writer.flush()
+
+    return report
+
+
+def _open_writer(run: Path) -> Any:
+    """TensorBoard's writer for a run folder.
+
+    Raises:
+        InputError: the package tensorboard is not installed.
+    """
+    try:
+        from torch.utils.tensorboard import SummaryWriter  # an optional package
+    except ImportError:
+        raise InputError(
+            "--tensorboard: expected the package tensorboard, found none; pip install tensorboard, or leave the option "
+            "out (history.csv holds the same values)"
+        ) from None
+    return SummaryWriter(run)
+
+
+def _failed_simulation(error: SimulationError) -> typer.Exit:
+    typer.echo(f"error: {error}", err=True)
+    return typer.Exit(1)
+
+
+def _describe(model: FittedModel) -> str:
+    """One line about a fitted model."""
+    if model.network is not None:
+        return f"trained a supervised residual network for meshes of {model.network.nodes} vertices"
+    parts = [] if model.field is None else ["trained a residual acceleration field"]
+    if model.material is not None:
+        e, nu = model.material["youngs_modulus"], model.material["poissons_ratio"]
+        identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
+        if "viscosity" in model.material:
+            identified += f", viscosity = {model.material['viscosity']:.0f} Pa s"
+        parts.append(identified)
+    integration = f", time integration {model.stepping['integrator']}" if model.stepping else ""
+    return " on ".join(parts) + integration
+
+
+def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
+    """Simulate every recording with the baseline simulator and every model; write tables and a report.
+
+    Args:
+        runs: run folders of the models.
+        files: dataset files.
+        folder: where errors.csv, motions.csv, errors.tex and report.html are written.
+
+    Raises:
+        InputError: a run or a dataset cannot be read, or a model is applicable to none of the datasets.
+        typer.Exit: a simulation failed; code 1.
+    """
+    torch.set_num_threads(TORCH_THREADS)
+    announce_compilation()
+    models = _models_by_name(runs)
+    datasets = [read_dataset(path) for path in files]
+    try:
+        comparisons, failed = _compare_all(datasets, models)
+    except SimulationError as error:
+        raise _failed_simulation(error) from None
+    recordings, splits, motions = error_table(comparisons), split_table(comparisons), motion_table(comparisons)
+    write_text(folder / "errors.csv", recordings.to_csv(index=False, float_format="%.6f"))
+    write_text(folder / "motions.csv", motions.to_csv(index=False, float_format="%.6f"))
+    write_text(folder / "errors.tex", latex_table(splits))
+    description = "; ".join(f"{name}: {_describe(model)}" for name, model in models.items())
+    write_report(folder / "report.html", comparisons, splits, recordings, motions, description)
+    Console(width=100).print(_error_table(splits))
+    transfer = Transfer.of(splits)
+    if transfer.errors.shape[1] > 1:
+        write_text(folder / "transfer.csv", transfer.errors.to_csv(float_format="%.6f"))
+    for name, count in transfer.negative.items():
+        failing = f"; its simulation fails on {failed[name]} more" if name in failed else ""
+        typer.echo(f"{name}: worse than the baseline simulator on {count} of {transfer.tried[name]} datasets{failing}")
+    typer.echo(f"wrote {folder}/errors.csv, motions.csv, errors.tex")
+    held_out = held_out_errors(comparisons)
+    if held_out:
+        values = ", ".join(f"{name} {1e3 * error:.3f} mm" for name, error in held_out.items())
+        typer.echo(f"held-out marker error: {values}")
+    else:
+        typer.echo("no recording has split `test`, so this error is not of held-out recordings", err=True)
+    typer.echo(f"report: {folder / 'report.html'} (open it in a browser)")
+
+
+def _error_table(splits: pd.DataFrame) -> Table:
+    table = Table("dataset", "split", "recordings", "method", "error [mm]")
+    for row in splits.itertuples():
+        value = f"{row.mean_mm:.3f} +- {row.std_mm:.3f}"
+        table.add_row(str(row.dataset), str(row.split), str(row.recordings), str(row.method), value)
+    return table
+
+
+def _compare_all(datasets: list[Dataset], models: dict[str, FittedModel]) -> tuple[list[Comparison], Counter[str]]:
+    """Compare every dataset with the models that are applicable to it.
+
+    Returns:
+        The comparisons, and for every model the number of datasets on which its simulation failed.
+
+    Raises:
+        SimulationError: the baseline simulator fails, or a model fails on every dataset to which it is applicable.
+    """
+    applicable = _applicable_models(datasets, models)
+    comparisons: list[Comparison] = []
+    failed: Counter[str] = Counter()
+    with progress() as bar:
+        for k, dataset in enumerate(bar.track(datasets, description="simulating")):
+            compared, failures = compare_those_that_simulate(dataset, applicable[k])
+            comparisons += compared
+            for name, error in failures.items():
+                failed[name] += 1
+                if failed[name] == sum(name in own for own in applicable):
+                    raise SimulationError(f"{name} on {dataset.name}: {error}")
+                typer.echo(f"left out on {dataset.name}: {name}: {error}", err=True)
+    return comparisons, failed
+
+
+def _applicable_models(datasets: list[Dataset], models: dict[str, FittedModel]) -> list[dict[str, FittedModel]]:
+    """The models that are applicable to the mesh of each dataset. Prints which are left out, and why.
+
+    Raises:
+        InputError: a model is applicable to none of the datasets.
+    """
+    applicable = [dict(models) for _ in datasets]
+    for name, model in models.items():
+        left_out = {}
+        for dataset, own in zip(datasets, applicable, strict=True):
+            try:
+                model.residual(dataset.simulator)
+            except InputError as error:
+                left_out[dataset.name] = error
+                own.pop(name)
+        if len(left_out) == len(datasets):
+            raise next(iter(left_out.values()))
+        for where, reason in left_out.items():
+            typer.echo(f"left out on {where}: {reason}", err=True)
+    return applicable
+
+
+def _models_by_name(runs: list[Path]) -> dict[str, FittedModel]:
+    """Models by method, or by method and folder where several runs share a method."""
+    models = [load_model(run) for run in runs]
+    methods = [model.method for model in models]
+    return {
+        model.method if methods.count(model.method) == 1 else f"{model.method} ({run.name})": model
+        for run, model in zip(runs, models, strict=True)
+    }

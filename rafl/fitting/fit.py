@@ -1,0 +1,112 @@
+"""Fit a model by any method: check the inputs, open the run folder, train."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from rafl.common.errors import InputError
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import read_dataset
+from rafl.fitting.distributed import process_count, rank
+from rafl.fitting.methods import EPOCHS, METHODS, check_inputs
+from rafl.fitting.run_folder import FittedModel, Settings, read_settings, write_settings
+from rafl.fitting.train_field import Report, nothing_to_follow
+from rafl.fitting.warm_start import LARGEST
+
+
+def fit(
+    datasets: Sequence[str | Path],
+    run: str | Path,
+    method: str = "rafl",
+    *,
+    resume: bool = False,
+    report: Report | None = None,
+    notify: Callable[[str], None] = warnings.warn,
+    epochs: int | None = None,
+    learning_rate: float = 1e-3,
+    weight_decay: float = 1e-5,
+    patience: int = 20,
+    frames: int = 0,
+    seed: int = 0,
+    batch: int = 1,
+    force_penalty: float = 1e-8,
+    warm_start: int = 20,
+    start: str | Path | None = None,
+    by_sigma: bool = False,
+    integrator: str = "",
+) -> FittedModel:
+    """Fit a model to the `train` recordings of datasets and keep the one with the least `val` error.
+
+    Args:
+        datasets: dataset files.
+        run: folder for model.pt, history.csv, config.yaml and the checkpoint; must not hold a run yet.
+        method: `rafl` (residual acceleration field), `srl` (supervised baseline), `sysid` (E and nu), `sysid-e` (E at
+            nu = 0.499) or `sysid-damping` (E, nu and viscosity).
+        resume: continue the interrupted run in the folder, with the same settings.
+        report: called with every row of the history.
+        notify: called with every remark on the settings.
+        epochs: maximum number of passes over the recordings; by method if None.
+        learning_rate: initial learning rate of Adam.
+        weight_decay: of Adam.
+        patience: epochs without a better validation error before training stops.
+        frames: number of leading frames that training simulates; 0 for all.
+        seed: of the weights and of the order of the recordings.
+        batch: recordings per update.
+        force_penalty: the paper's lambda_1 [m^2/N^2].
+        warm_start: passes of pre-training on residual targets.
+        start: run folder to fine-tune, or a `sysid` run whose material the field corrects.
+        by_sigma: weight markers by their uncertainty.
+        integrator: `implicit-euler` or `generalised-alpha`; that of the datasets if empty.
+
+    Raises:
+        InputError: a file, the run folder or an option does not suit the method.
+        SimulationError: the simulator did not converge; the message names recording and step.
+    """
+    loaded = [read_dataset(Path(path)) for path in datasets]
+    settings = Settings(
+        method=method,
+        datasets=tuple(str(Path(path).resolve()) for path in datasets),
+        epochs=epochs or EPOCHS.get(method, 1),
+        learning_rate=learning_rate,
+        weight_decay=weight_decay,
+        patience=patience,
+        frames=frames,
+        seed=seed,
+        batch=batch,
+        force_penalty=force_penalty,
+        warm_start=warm_start,
+        start=str(Path(start).resolve()) if start else "",
+        by_sigma=by_sigma,
+        integrator=integrator,
+    )
+    check_inputs(method, loaded, Path(start) if start else None, integrator)
+    if rank() == 0:  # of the processes that torchrun started
+        open_run(Path(run), settings, resume)
+        _remark(loaded, settings, notify)
+    return METHODS[method](loaded, settings, Path(run), report or (lambda row: None))
+
+
+def _remark(datasets: list[Dataset], settings: Settings, notify: Callable[[str], None]) -> None:
+    """Say what the settings leave unused."""
+    if process_count() > settings.batch:
+        notify(f"{process_count()} processes share a batch of {settings.batch}: raise the batch to use them all")
+    if settings.method == "rafl" and nothing_to_follow(datasets, settings):
+        notify(f"no pre-training: it needs implicit-euler, one substep, no viscosity and at most {LARGEST} vertices")
+
+
+def open_run(run: Path, settings: Settings, resume: bool) -> None:
+    """Create a run folder, or reopen it to resume. Two runs never share a folder.
+
+    Raises:
+        InputError: the folder holds a run already, or, to resume, a run with other settings.
+    """
+    if resume:
+        earlier = read_settings(run)
+        if earlier != settings:
+            raise InputError(
+                f"expected the settings in {run}/config.yaml to resume, found others; use the same settings"
+            )
+        return
+    if (run / "config.yaml").exists():
+        raise InputError(f"{run} already holds a run; choose another --out, or continue it with --resume")
+    write_settings(run, settings)

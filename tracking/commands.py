@@ -1,0 +1,297 @@
+"""What `rafl-calibrate` and `rafl-track` do once their options are checked: call the library, print and write."""
+
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+from threadpoolctl import threadpool_limits
+
+from rafl.calibration.board import read_board
+from rafl.calibration.board_images import board_views, check_placed
+from rafl.calibration.camera import Camera
+from rafl.calibration.rig import Rig, read_rig, write_rig
+from rafl.calibration.solve import solve_rig
+from rafl.calibration.summary import camera_table, check_table, lens_lines
+from rafl.calibration.validation import check_view, write_picture
+from rafl.common.command_line import progress
+from rafl.common.errors import InputError
+from rafl.common.kernels import announce_compilation
+from rafl.tracking.linking.layout import read_layout
+from rafl.tracking.overlay import write_overlay
+from rafl.tracking.pipeline import TrackingSettings, finished, track_recording
+from rafl.tracking.reconstruction.export import WRITERS, export_name
+from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
+from rafl.tracking.report import summary_cells, write_report
+from rafl.tracking.rest import FACES, camera_at_rest, rest_videos
+from rafl.tracking.video.reader import Video
+from rafl.tracking.video.recordings import find_recordings
+
+# Time [s] between two checks for a signal while waiting for a recording: not every signal interrupts the wait.
+SIGNAL_CHECK_S = 1.0
+# Longest time [s] that a thread waits for the interpreter. A decoder that waits for it decodes nothing.
+THREAD_SWITCH_S = 1e-4
+
+
+def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth: float, out: Path) -> None:
+    """Calibrate a rig from board images, print its cameras and write it.
+
+    Args:
+        images: folder with one subfolder of board images per camera.
+        board: board description.
+        model: orthographic or pinhole.
+        tilt_sign: CAMERA=+ or CAMERA=-, as the option says.
+        depth: of the specimen [m].
+        out: calibration to write.
+
+    Raises:
+        InputError: a file cannot be read, or the images do not determine the cameras.
+    """
+    description = read_board(board)
+    views, sizes = board_views(images, description)
+    check_placed(views)
+    solution = solve_rig(views, sizes, description, _tilt_signs(tilt_sign, list(views)), model)
+    write_rig(out, solution.rig)
+    Console(width=110).print(camera_table(solution, views))
+    for line in lens_lines(solution, depth, model):
+        typer.echo(line)
+    _print_next(out)
+
+
+def calibrate_from_rest(folder: Path, specimen: Path, face: list[str], tilt_sign: list[str], out: Path) -> None:
+    """Calibrate a rig from videos of the specimen at rest, print its cameras and write it.
+
+    Args:
+        folder: one video per camera.
+        specimen: specimen description with the marker positions.
+        face: CAMERA=FACE, the face that a camera films.
+        tilt_sign: CAMERA=+ or CAMERA=-, as the option says.
+        out: calibration to write.
+
+    Raises:
+        InputError: a file cannot be read, or the markers do not determine a camera.
+    """
+    announce_compilation()
+    layout = read_layout(specimen)
+    videos = rest_videos(folder)
+    faces = _values_by_camera("--face", face, list(videos), tuple(FACES))
+    signs = _tilt_signs(tilt_sign, list(videos))
+    table = Table("camera", "face", "markers", "residual [px]", "px/mm", "+-", "tilt [deg]")
+    cameras: dict[str, Camera] = {}
+    with progress() as bar:
+        for name, video in videos.items():
+            task = bar.add_task(name, total=video.frames or None)
+            tick = partial(bar.advance, task)
+            view = camera_at_rest(name, video, layout, faces.get(name), signs.get(name), tick)
+            camera, found = view.found.camera, view.found
+            cameras[name] = camera
+            assert camera.covariance
+            tilt = f"below {np.degrees(found.unsure):.1f}" if found.unsure else f"{np.degrees(found.tilt):.1f}"
+            numbers = (
+                f"{camera.residual:.3f}",
+                f"{1e-3 * camera.scale[0]:.4f}",
+                f"{camera.covariance[0][0] ** 0.5:.4f}",
+            )
+            table.add_row(name, view.face, str(view.markers), *numbers, tilt)
+    write_rig(out, Rig(cameras))
+    Console(width=110).print(table)
+    typer.echo("assumed: square pixels, no lens distortion, no perspective; only a board shows whether they hold")
+    _print_next(out)
+
+
+def check_calibration(calib: Path, images: Path, board: Path) -> None:
+    """Print the residuals of a calibration on board images, and draw them into check-CAMERA.png.
+
+    Raises:
+        InputError: a file cannot be read, or the images are not of the calibrated cameras.
+    """
+    views, sizes = board_views(images, read_board(board))
+    rig = read_rig(calib)
+    checked = {}
+    for name, own in views.items():
+        if name not in rig.cameras:
+            raise InputError(f"expected images of {', '.join(rig.cameras)} as in {calib}, found camera {name!r}")
+        camera = rig.cameras[name]
+        if camera.image_size != sizes[name]:
+            raise InputError(
+                f"camera {name}: expected images of {camera.image_size[0]} x {camera.image_size[1]} as calibrated, "
+                f"found {sizes[name][0]} x {sizes[name][1]}; take them at the calibrated size"
+            )
+        if not own:
+            raise InputError(f"camera {name}: expected images that show the board, found none; check board.yaml")
+        with progress() as bar:
+            placed = bar.track(own, description=f"{name}: locating the board")
+            checked[name] = [check_view(camera, view) for view in placed]
+        path = Path(f"check-{name}.png")
+        write_picture(path, camera.image_size, checked[name], name)
+        typer.echo(f"wrote {path}")
+    Console(width=110).print(check_table(rig, checked))
+
+
+def _print_next(out: Path) -> None:
+    typer.echo(f"wrote {out}")
+    typer.echo(f"next: rafl-track videos/ --calib {out}")
+
+
+def _values_by_camera(option: str, given: list[str], cameras: list[str], allowed: tuple[str, ...]) -> dict[str, str]:
+    """The values of CAMERA=VALUE options. A single camera need not be named."""
+    values = {}
+    for text in given:
+        camera, _, value = text.rpartition("=")
+        if not camera and len(cameras) == 1:
+            camera = cameras[0]
+        if camera not in cameras or value not in allowed:
+            raise InputError(
+                f"{option}: expected CAMERA=VALUE with one of {', '.join(cameras)} and one of {', '.join(allowed)}, "
+                f"found {text!r}"
+            )
+        values[camera] = value
+    return values
+
+
+def _tilt_signs(given: list[str], cameras: list[str]) -> dict[str, int]:
+    values = _values_by_camera("--tilt-sign", given, cameras, ("+", "-"))
+    return {camera: 1 if sign == "+" else -1 for camera, sign in values.items()}
+
+
+def track(
+    videos: Path,
+    calib: Path,
+    specimen: Path | None,
+    out: Path,
+    fps: float | None,
+    fill: int,
+    sync: bool,
+    exports: list[str],
+    overlay: bool,
+    jobs: int | None,
+) -> None:
+    """Track every recording that has no tracks yet; write tracks, exports, overlays and a report.
+
+    Args:
+        videos: folder of videos, or one video.
+        calib: calibration.
+        specimen: specimen description that names the markers; None to name them by row and column.
+        out: folder for the tracks.
+        fps: true frames per second; None to trust the videos.
+        fill: longest gap to fill [frames].
+        sync: whether to find the time offsets of the cameras from the motion.
+        exports: keys of `WRITERS`.
+        overlay: whether to write overlay videos.
+        jobs: recordings tracked at the same time; None for the number of cores.
+
+    Raises:
+        InputError: a file cannot be read, or no recording could be tracked.
+        typer.Exit: some recordings could not be tracked; code 1.
+    """
+    announce_compilation()
+    rig = read_rig(calib)
+    settings = TrackingSettings(read_layout(specimen) if specimen else None, fps, fill, sync)
+    recordings = find_recordings(videos, rig, calib)
+    done: dict[str, Tracks] = {}
+    failed: dict[str, str] = {}
+    kept: list[str] = []
+    cv2.setNumThreads(1)  # the decoding and tracking threads use the cores; BLAS threads would keep them busy
+    sys.setswitchinterval(THREAD_SWITCH_S)
+    one_thread = threadpool_limits(1, user_api="blas")
+    with one_thread, progress() as bar, _thread_pool(jobs or os.cpu_count() or 1) as (pool, stopped):
+        waiting = {
+            name: pool.submit(_track_one, out / f"{name}.h5", sources, rig, settings, bar, stopped)
+            for name, sources in recordings.items()
+        }
+        for name, future in waiting.items():
+            while not wait([future], SIGNAL_CHECK_S).done:
+                pass
+            try:
+                done[name], was_there = future.result()
+            except InputError as error:
+                failed[name] = str(error)
+                continue
+            if was_there:
+                kept.append(name)
+            if overlay:
+                for camera, video in recordings[name].items():
+                    path = out / f"{name}_{camera}_overlay.mp4"
+                    task = bar.add_task(f"{name}: drawing {camera}", total=len(done[name].time))
+                    tick = partial(bar.advance, task)
+                    write_overlay(path, video, camera, rig.cameras[camera], done[name], tick)
+                    bar.remove_task(task)
+            for kind in exports:
+                WRITERS[kind](out / export_name(kind, name, list(recordings).index(name)), done[name])
+    if not done:
+        first = next(iter(failed))
+        raise InputError(f"recording {first}: {failed[first]}")
+    write_report(out / "report.html", done, rig)
+    _print_results(out, done, failed, len(kept))
+    if failed:
+        raise typer.Exit(1)
+
+
+def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int) -> None:
+    Console(width=110).print(_summary_table(done))
+    for name, tracks in done.items():
+        for note in tracks.notes:
+            typer.echo(f"note: recording {name}: {note}")
+    for name, reason in failed.items():
+        typer.echo(f"error: recording {name}: {reason}", err=True)
+    if kept:
+        typer.echo(f"kept the tracks of {kept} recordings: nothing changed since they were tracked")
+    typer.echo(f"wrote {len(done) - kept} tracks files to {out}/; look at {out}/report.html")
+    typer.echo(f"next: rafl-capture specimen.yaml {out} --recordings recordings.csv --out datasets/NAME.h5")
+
+
+@contextmanager
+def _thread_pool(jobs: int) -> Iterator[tuple[ThreadPoolExecutor, threading.Event]]:
+    """A pool of threads, and an event that is set when the command is stopped, which ends their work."""
+    stopped = threading.Event()
+    pool = ThreadPoolExecutor(jobs)
+    try:
+        yield pool, stopped
+    finally:
+        stopped.set()
+        pool.shutdown(cancel_futures=True)
+
+
+def _track_one(
+    path: Path,
+    sources: dict[str, Video],
+    rig: Rig,
+    settings: TrackingSettings,
+    bar: Progress,
+    stopped: threading.Event,
+) -> tuple[Tracks, bool]:
+    """The tracks of one recording, and whether they were there before."""
+    before = finished(path, sources, rig, settings)
+    if before is not None:
+        return before, True
+    total = sum(video.frames for video in sources.values())
+    task = bar.add_task(path.stem, total=total or None)
+
+    def tick() -> None:
+        if stopped.is_set():
+            raise CancelledError
+        bar.advance(task)
+
+    try:
+        tracks = track_recording(sources, rig, settings, tick)
+        write_tracks(path, tracks)
+        return tracks, False
+    finally:
+        bar.remove_task(task)
+
+
+def _summary_table(done: dict[str, Tracks]) -> Table:
+    table = Table("recording", "frames", "markers", "measured", "filled", "missing", "sigma [px]", "residual [px]")
+    for name, tracks in done.items():
+        table.add_row(name, *summary_cells(tracks))
+    return table
