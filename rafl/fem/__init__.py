@@ -1,1 +1,1 @@
-"""Finite elements: meshes, quadrature, materials, elastic laws and their kernels."""
+"""Finite elements: meshes, quadrature, materials, elastic laws and their compiled kernels."""

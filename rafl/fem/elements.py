@@ -1,6 +1,7 @@
-"""Energy, nodal gradient and tangent of a batch of deformed meshes, compiled.
+"""Compiled kernels for the energy, nodal gradient and tangent of a batch of deformed meshes.
 
-`rafl.simulation.reference_engine` says the same in tensors and is what these kernels are tested against.
+`w` is the scratch array of one cell; see `rafl.fem.kernel_layout`. The kernels are tested against the tensor
+implementation in `rafl.simulation.reference_engine`.
 """
 
 import numpy as np
@@ -17,7 +18,7 @@ from rafl.fem.kernel_layout import (
     PRODUCT,
     ROWS,
     SECOND,
-    SLOPES,
+    SHAPE_GRADIENTS,
     STIFFNESS,
     STRESS,
     STRETCH,
@@ -29,27 +30,27 @@ from rafl.fem.kernel_layout import (
     V,
 )
 from rafl.fem.laws import corotated, neo_hookean, projective
-from rafl.fem.simd import KERNEL, lane_products, transposed_product, weighted_rows
-from rafl.fem.svd import signed_svd_lanes
+from rafl.fem.simd import KERNEL_OPTIONS, lane_products, transposed_product, weighted_rows
+from rafl.fem.svd import signed_svd_simd
 
-# Of the 24 x 24 stiffness the blocks (component i, component k <= i), each over 8 x 8 nodes, are kept.
-BLOCKS = 6
-CHUNK = 16  # cells a thread takes at a time
+# Stored blocks of a cell's symmetric 24 x 24 stiffness: (component i, component k <= i), each 8 x 8 nodes.
+COMPONENT_BLOCKS = 6
+CELLS_PER_CHUNK = 16  # number of cells in one task of a thread
 
 _projective = projective.derivatives
 _corotated = corotated.derivatives
 _neo_hookean = neo_hookean.derivatives
 
-_gather = weighted_rows(8, 3, 24)  # sum over nodes of position times gradient
-_by_nodes = weighted_rows(3, 8, 8, add=True)
-_couple = weighted_rows(3, 8, 8)
-_modes_product = lane_products(9, 72, 72)
-_to_stiffness = transposed_product(24)
+_component_gradient = weighted_rows(8, 3, 24)  # sum over nodes of nodal value times gradient
+_add_nodal_force = weighted_rows(3, 8, 8, add=True)
+_tangent_times_gradients = weighted_rows(3, 8, 8)
+_mode_products = lane_products(9, 72, 72)
+_add_stiffness_block = transposed_product(24)
 
 
-@njit(**KERNEL)
-def _project_lanes(w):
-    """Make the law's second derivatives positive semi-definite, lane by lane."""
+@njit(**KERNEL_OPTIONS)
+def _project_semidefinite(w):
+    """Project the second derivatives, flips and twists of each point to positive semi-definite ones."""
     A = np.empty((3, 3))
     for g in range(8):
         for i in range(3):
@@ -64,18 +65,18 @@ def _project_lanes(w):
         for i in range(3):
             j = (i + 1) % 3
             diagonal = 0.0
-            beside = 0.0
+            off_diagonal = 0.0
             for k in range(3):
                 value = max(values[k], 0.0)
                 diagonal += vectors[i, k] * value * vectors[i, k]
-                beside += vectors[i, k] * value * vectors[j, k]
+                off_diagonal += vectors[i, k] * value * vectors[j, k]
             w[(SECOND + i) * 8 + g] = diagonal
-            w[(SECOND + 3 + i) * 8 + g] = beside
+            w[(SECOND + 3 + i) * 8 + g] = off_diagonal
 
 
-@njit(**KERNEL)
-def _stress(w):
-    """Weight times P = U diag(first) V^T, and the twist stiffnesses."""
+@njit(**KERNEL_OPTIONS)
+def _fill_stress(w):
+    """Fill STRESS with weight times P = U diag(psi_i) V^T, and TWIST."""
     for i in range(3):
         for j in range(3):
             for g in range(8):
@@ -85,28 +86,28 @@ def _stress(w):
                     + w[(FIRST + 2) * 8 + g] * w[(U + 3 * i + 2) * 8 + g] * w[(V + 3 * j + 2) * 8 + g]
                 )
     for k in range(3):
-        after = (k + 1) % 3
+        following = (k + 1) % 3
         for g in range(8):
-            total = w[(STRETCH + k) * 8 + g] + w[(STRETCH + after) * 8 + g]
+            total = w[(STRETCH + k) * 8 + g] + w[(STRETCH + following) * 8 + g]
             total = total if abs(total) > 1e-8 else np.copysign(1e-8, total)
-            w[(TWIST + k) * 8 + g] = (w[(FIRST + k) * 8 + g] + w[(FIRST + after) * 8 + g]) / total
+            w[(TWIST + k) * 8 + g] = (w[(FIRST + k) * 8 + g] + w[(FIRST + following) * 8 + g]) / total
 
 
-@njit(**KERNEL)
-def _tangent(w):
-    """Weight times d P / d F (9 x 9) from nine modes: three stretches, and two matrices of each pair."""
+@njit(**KERNEL_OPTIONS)
+def _fill_tangent(w):
+    """Fill TANGENT with weight times d P / d F (9 x 9), from nine modes: three stretches, two matrices per pair."""
     for m in range(3):
-        after = (m + 1) % 3
+        following = (m + 1) % 3
         for i in range(3):
             for j in range(3):
                 r = 3 * i + j
                 for g in range(8):
                     w[(MODES + 9 * m + r) * 8 + g] = w[(U + 3 * i + m) * 8 + g] * w[(V + 3 * j + m) * 8 + g]
                     w[(MODES + 9 * (3 + 2 * m) + r) * 8 + g] = (
-                        w[(U + 3 * i + m) * 8 + g] * w[(V + 3 * j + after) * 8 + g]
+                        w[(U + 3 * i + m) * 8 + g] * w[(V + 3 * j + following) * 8 + g]
                     )
                     w[(MODES + 9 * (4 + 2 * m) + r) * 8 + g] = (
-                        w[(U + 3 * i + after) * 8 + g] * w[(V + 3 * j + m) * 8 + g]
+                        w[(U + 3 * i + following) * 8 + g] * w[(V + 3 * j + m) * 8 + g]
                     )
     for r in range(9):
         for g in range(8):
@@ -127,22 +128,23 @@ def _tangent(w):
             for g in range(8):
                 x = w[(MODES + 9 * (3 + 2 * m) + r) * 8 + g]
                 y = w[(MODES + 9 * (4 + 2 * m) + r) * 8 + g]
-                same = w[TEMPORARY * 8 + g]
-                other = w[(TEMPORARY + 1) * 8 + g]
-                w[(COUPLED + 9 * (3 + 2 * m) + r) * 8 + g] = same * x + other * y
-                w[(COUPLED + 9 * (4 + 2 * m) + r) * 8 + g] = other * x + same * y
+                diagonal = w[TEMPORARY * 8 + g]
+                coupling = w[(TEMPORARY + 1) * 8 + g]
+                w[(COUPLED + 9 * (3 + 2 * m) + r) * 8 + g] = diagonal * x + coupling * y
+                w[(COUPLED + 9 * (4 + 2 * m) + r) * 8 + g] = coupling * x + diagonal * y
     for r in range(9):
         for c in range(r + 1):
-            _modes_product(w, (TANGENT + 9 * r + c) * 8, w, (MODES + r) * 8, w, (COUPLED + c) * 8)
+            _mode_products(w, (TANGENT + 9 * r + c) * 8, w, (MODES + r) * 8, w, (COUPLED + c) * 8)
             for g in range(8):
                 w[(TANGENT + 9 * c + r) * 8 + g] = w[(TANGENT + 9 * r + c) * 8 + g]
 
 
-@njit(**KERNEL)
-def _damp(w, moduli, velocity, strain, rate, strain_rate, project, tangent):
-    """Add viscous stress F (2 eta E') and stiffness-proportional stress to STRESS, ENERGY and TANGENT.
+@njit(**KERNEL_OPTIONS)
+def _add_damping(w, moduli, velocity_gradient, strain_offset, velocity_factor, strain_factor, project, tangent):
+    """Add the viscous stress F (2 eta dE/dt) and the stiffness-proportional stress to STRESS, ENERGY and TANGENT.
 
-    velocity (9, 8): its rest-frame gradient; strain (8, 6): what is subtracted from strain_rate * E.
+    velocity_gradient (9, 8): in the rest frame [1/s]. strain_offset (8, 6): dE/dt is
+    strain_factor * E - strain_offset [1/s].
     """
     eta = moduli[2]
     mu = moduli[3]
@@ -160,17 +162,17 @@ def _damp(w, moduli, velocity, strain, rate, strain_rate, project, tangent):
                 green = -0.5 if i == j else 0.0
                 for k in range(3):
                     green += 0.5 * F[k, i] * F[k, j]
-                place = i if i == j else (5 if j - i == 2 else 3 + i)
-                S[i, j] = S[j, i] = strain_rate * green - strain[g, place]
-                energy += (1.0 if i == j else 2.0) * eta / strain_rate * S[i, j] * S[i, j]
+                component = i if i == j else (5 if j - i == 2 else 3 + i)
+                S[i, j] = S[j, i] = strain_factor * green - strain_offset[g, component]
+                energy += (1.0 if i == j else 2.0) * eta / strain_factor * S[i, j] * S[i, j]
                 S[i, j] = S[j, i] = 2.0 * eta * S[i, j]
-        trace = velocity[0, g] + velocity[4, g] + velocity[8, g]
-        energy += 0.5 / rate * lam * trace * trace
+        trace = velocity_gradient[0, g] + velocity_gradient[4, g] + velocity_gradient[8, g]
+        energy += 0.5 / velocity_factor * lam * trace * trace
         for i in range(3):
             for j in range(3):
-                shear = 0.5 * (velocity[3 * i + j, g] + velocity[3 * j + i, g])
-                energy += mu / rate * shear * shear
-                stress = 2.0 * mu * shear + (lam * trace if i == j else 0.0)
+                strain_rate = 0.5 * (velocity_gradient[3 * i + j, g] + velocity_gradient[3 * j + i, g])
+                energy += mu / velocity_factor * strain_rate * strain_rate
+                stress = 2.0 * mu * strain_rate + (lam * trace if i == j else 0.0)
                 for k in range(3):
                     stress += F[i, k] * S[k, j]
                 w[(STRESS + 3 * i + j) * 8 + g] += weight * stress
@@ -181,88 +183,106 @@ def _damp(w, moduli, velocity, strain, rate, strain_rate, project, tangent):
             for j in range(3):
                 for k in range(3):
                     for m in range(3):
-                        value = eta * strain_rate * F[i, m] * F[k, j]
+                        value = eta * strain_factor * F[i, m] * F[k, j]
                         if j == m:
                             for n in range(3):
-                                value += eta * strain_rate * F[i, n] * F[k, n]
+                                value += eta * strain_factor * F[i, n] * F[k, n]
                         if i == k:
-                            value += rate * mu * (1.0 if j == m else 0.0)
+                            value += velocity_factor * mu * (1.0 if j == m else 0.0)
                             if not project:
                                 value += S[j, m]
                         if i == m and j == k:
-                            value += rate * mu
+                            value += velocity_factor * mu
                         if i == j and k == m:
-                            value += rate * lam
+                            value += velocity_factor * lam
                         w[(TANGENT + 9 * (3 * i + j) + 3 * k + m) * 8 + g] += weight * value
 
 
-@njit(**KERNEL)
-def _cell(w, x, by_point, by_node, law, mu, lam, damped, moduli, velocity, strain, rate, strain_rate, project, tangent):
-    """Add one group of eight points to the scratch's FORCE and STIFFNESS; returns the energy [J].
+@njit(**KERNEL_OPTIONS)
+def _add_cell(
+    w,
+    x,
+    gradients_by_point,
+    gradients_by_node,
+    law,
+    mu,
+    lam,
+    damped,
+    moduli,
+    velocity_gradient,
+    strain_offset,
+    velocity_factor,
+    strain_factor,
+    project,
+    tangent,
+):
+    """Add one group of eight points to FORCE and STIFFNESS; return its energy [J].
 
-    x: corner positions, then velocities, (48).
+    x (48): the positions of the cell's nodes, then their velocities. velocity_gradient (72) is working memory.
     """
     for i in range(192):
-        w[SLOPES * 8 + i] = by_node[i]
+        w[SHAPE_GRADIENTS * 8 + i] = gradients_by_node[i]
     for i in range(3):
         for j in range(3):
-            _gather(w, (DEFORMATION + 3 * i + j) * 8, x, i, by_point, 8 * j)
-    signed_svd_lanes(w)
+            _component_gradient(w, (DEFORMATION + 3 * i + j) * 8, x, i, gradients_by_point, 8 * j)
+    signed_svd_simd(w)
     if law == 0:
         _projective(w, mu, lam)
     elif law == 1:
         _corotated(w, mu, lam)
     else:
         _neo_hookean(w, mu, lam)
-    _stress(w)
+    _fill_stress(w)
     if tangent:
         if project:
-            _project_lanes(w)
-        _tangent(w)
+            _project_semidefinite(w)
+        _fill_tangent(w)
     if damped:
         for i in range(3):
             for j in range(3):
-                _gather(velocity, (3 * i + j) * 8, x, 24 + i, by_point, 8 * j)
-        _damp(w, moduli, velocity.reshape(9, 8), strain, rate, strain_rate, project, tangent)
+                _component_gradient(velocity_gradient, (3 * i + j) * 8, x, 24 + i, gradients_by_point, 8 * j)
+        _add_damping(
+            w, moduli, velocity_gradient.reshape(9, 8), strain_offset, velocity_factor, strain_factor, project, tangent
+        )
     energy = 0.0
     for g in range(8):
         energy += w[WEIGHT * 8 + g] * w[ENERGY * 8 + g]
         for i in range(3):
-            _by_nodes(w, (FORCE + i) * 8, w, (STRESS + 3 * i) * 8 + g, w, (SLOPES + 3 * g) * 8)
+            _add_nodal_force(w, (FORCE + i) * 8, w, (STRESS + 3 * i) * 8 + g, w, (SHAPE_GRADIENTS + 3 * g) * 8)
     if tangent:
         block = 0
         for i in range(3):
             for k in range(i + 1):
                 for g in range(8):
                     for j in range(3):
-                        _couple(
+                        _tangent_times_gradients(
                             w,
                             (PRODUCT + 3 * g + j) * 8,
                             w,
                             (TANGENT + 9 * (3 * i + j) + 3 * k) * 8 + g,
                             w,
-                            (SLOPES + 3 * g) * 8,
+                            (SHAPE_GRADIENTS + 3 * g) * 8,
                         )
-                _to_stiffness(w, (STIFFNESS + 8 * block) * 8, w, SLOPES * 8, w, PRODUCT * 8)
+                _add_stiffness_block(w, (STIFFNESS + 8 * block) * 8, w, SHAPE_GRADIENTS * 8, w, PRODUCT * 8)
                 block += 1
     return energy
 
 
-@njit(parallel=True, **KERNEL)
+@njit(parallel=True, **KERNEL_OPTIONS)
 def element_terms(
     q,
     hexes,
-    by_point,
-    by_node,
+    gradients_by_point,
+    gradients_by_node,
     volume,
-    shares,
+    group_shares,
     law,
     moduli,
     damped,
-    drift,
-    strain,
-    rate,
-    strain_rate,
+    velocity_offset,
+    strain_offset,
+    velocity_factor,
+    strain_factor,
     project,
     tangent,
     energy,
@@ -274,59 +294,63 @@ def element_terms(
     Args:
         q: positions [m], (B, N, 3).
         hexes: (E, 8).
-        by_point, by_node: gradients [1/m], (E, G, 8 nodes * 3 * 8 points), (E, G, 8 points * 3 * 8 nodes).
+        gradients_by_point: shape function gradients [1/m], (E, G, 8 nodes * 3 * 8 points).
+        gradients_by_node: the same in the order (E, G, 8 points * 3 * 8 nodes).
         volume: of each point [m^3], (E, G, 8).
-        shares: how much of mu and of lambda the points of a group carry, (G, 2).
-        law: number of the elastic law in `LAWS`.
-        moduli: mu, lambda [Pa], viscosity [Pa s], stiffness damping times rest mu and lambda [Pa s], (B, 5).
-        damped: whether the last three, and the four that follow, count.
-        drift, rate: velocities are rate * q - drift, (B, N, 3) [m/s].
-        strain, strain_rate: Green strain rates are strain_rate * E - strain, (B, E, 8 G, 6) [1/s].
-        project: make the tangent positive semi-definite, point by point.
+        group_shares: fraction of mu and of lambda that each group of points integrates, (G, 2).
+        law: index of the elastic law in `LAWS`.
+        moduli: mu, lambda [Pa]; viscosity, stiffness damping times rest mu and lambda [Pa s]; (B, 5).
+        damped: whether damping acts; if not, the last three moduli and the next four arguments are ignored.
+        velocity_offset: velocities are velocity_factor * q - velocity_offset, (B, N, 3) [m/s].
+        strain_offset: Green strain rates are strain_factor * E - strain_offset, (B, E, 8 G, 6) [1/s].
+        velocity_factor, strain_factor: [1/s].
+        project: make the tangent positive semi-definite at each point.
+        tangent: whether to compute the stiffness.
+        energy, gradient, stiffness: [J], [N], [N/m]; outputs.
     """
     batch, cells, groups = q.shape[0], hexes.shape[0], volume.shape[1]
-    chunks = (cells + CHUNK - 1) // CHUNK
+    chunks = (cells + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK
     force = np.empty((batch, cells, 24))
-    part = np.empty((batch, chunks))
+    chunk_energy = np.empty((batch, chunks))
     for task in prange(batch * chunks):
         t = task // chunks
         chunk = task % chunks
         w = np.empty(ROWS * 8)
         x = np.zeros(48)
-        velocity = np.zeros(72)
+        velocity_gradient = np.zeros(72)
         total = 0.0
-        for e in range(chunk * CHUNK, min(cells, (chunk + 1) * CHUNK)):
+        for e in range(chunk * CELLS_PER_CHUNK, min(cells, (chunk + 1) * CELLS_PER_CHUNK)):
             for n in range(8):
                 node = hexes[e, n]
                 for i in range(3):
                     x[3 * n + i] = q[t, node, i]
                     if damped:
-                        x[24 + 3 * n + i] = rate * q[t, node, i] - drift[t, node, i]
+                        x[24 + 3 * n + i] = velocity_factor * q[t, node, i] - velocity_offset[t, node, i]
             for i in range(24):
                 w[FORCE * 8 + i] = 0.0
             if tangent:
-                for i in range(BLOCKS * 64):
+                for i in range(COMPONENT_BLOCKS * 64):
                     w[STIFFNESS * 8 + i] = 0.0
             for group in range(groups):
                 for g in range(8):
                     w[WEIGHT * 8 + g] = volume[e, group, g]
-                own = moduli[t] * shares[group, 0]
-                own[4] = moduli[t, 4] * shares[group, 1]
-                past = strain[t, e, 8 * group : 8 * group + 8] if damped else strain[0, 0]
-                total += _cell(
+                group_moduli = moduli[t] * group_shares[group, 0]
+                group_moduli[4] = moduli[t, 4] * group_shares[group, 1]
+                cell_strain_offset = strain_offset[t, e, 8 * group : 8 * group + 8] if damped else strain_offset[0, 0]
+                total += _add_cell(
                     w,
                     x,
-                    by_point[e, group],
-                    by_node[e, group],
+                    gradients_by_point[e, group],
+                    gradients_by_node[e, group],
                     law,
-                    own[0],
-                    moduli[t, 1] * shares[group, 1],
+                    group_moduli[0],
+                    moduli[t, 1] * group_shares[group, 1],
                     damped,
-                    own,
-                    velocity,
-                    past,
-                    rate,
-                    strain_rate,
+                    group_moduli,
+                    velocity_gradient,
+                    cell_strain_offset,
+                    velocity_factor,
+                    strain_factor,
                     project,
                     tangent,
                 )
@@ -334,11 +358,11 @@ def element_terms(
                 force[t, e, i] = w[FORCE * 8 + i]
             if tangent:
                 out = stiffness[t, e]
-                for i in range(BLOCKS * 64):
+                for i in range(COMPONENT_BLOCKS * 64):
                     out[i // 64, (i // 8) % 8, i % 8] = w[STIFFNESS * 8 + i]
-        part[t, chunk] = total
+        chunk_energy[t, chunk] = total
     for t in prange(batch):
-        energy[t] = part[t].sum()
+        energy[t] = chunk_energy[t].sum()
         gradient[t] = 0.0
         for e in range(cells):
             for i in range(3):
@@ -346,9 +370,9 @@ def element_terms(
                     gradient[t, hexes[e, n], i] += force[t, e, 8 * i + n]
 
 
-@njit(parallel=True, **KERNEL)
+@njit(parallel=True, **KERNEL_OPTIONS)
 def multiply(stiffness, cells, hexes, x, out):
-    """Fill out (B, N, 3) with the stiffnesses (B, E, 6, 8, 8) of some cells times x (B, N, 3)."""
+    """Fill out (B, N, 3) with the product of stiffness (B, E, 6, 8, 8), summed over `cells`, and x (B, N, 3)."""
     for t in prange(x.shape[0]):
         out[t] = 0.0
         for e in cells:

@@ -1,4 +1,4 @@
-"""What a specimen is made of."""
+"""Material parameters of a specimen."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from rafl.fem.laws import LAWS
 from rafl.fem.mesh import HexMesh
 
-MASSES = ("lumped", "uniform")
-INTEGRATIONS = ("full", "selective")
+MASS_MODELS = ("lumped", "uniform")
+INTEGRATION_SCHEMES = ("full", "selective")
 
-# Named pairs of law and mass: the paper's simulator, and what a real specimen is closer to.
+# Law and mass model of the paper's simulator, and those that are closer to a real specimen.
 PRESETS: dict[str, dict[str, str]] = {
     "paper": {"law": "projective", "mass": "uniform"},
     "physical": {"law": "corotated", "mass": "lumped"},
@@ -20,7 +20,7 @@ PRESETS: dict[str, dict[str, str]] = {
 
 
 def lame(youngs_modulus: Any, poissons_ratio: Any) -> tuple[Any, Any]:
-    """Lame's mu and lambda [Pa] from E [Pa] and nu; floats, arrays and tensors alike."""
+    """Lame parameters mu and lambda [Pa] from E [Pa] and nu, for floats, arrays and tensors."""
     e, nu = youngs_modulus, poissons_ratio
     mu = e / (2.0 * (1.0 + nu))
     lam = e * nu / ((1.0 + nu) * (1.0 - 2.0 * nu))
@@ -35,19 +35,19 @@ class Material:
         youngs_modulus: E [Pa].
         poissons_ratio: nu, below 0.5.
         density: rho [kg/m^3].
-        mass: how the nodes carry it. `uniform`: rho times the mean cell volume at every node, as the
-            paper's simulator has it (a beam then weighs about twice its truth); `lumped`: each
-            node's share of its cells, which adds up to the true mass.
+        mass: mass model. `uniform`: every node has rho times the mean cell volume, as in the paper's
+            simulator; a beam then has about twice its true mass. `lumped`: every node has its share of the
+            adjacent cells' mass; the sum is the true mass.
         law: elastic law, one of `rafl.fem.laws.LAWS`.
-        integration: `full`, at eight points a cell; `selective`, lambda's part of the cell's mean
-            strain only (B-bar), so that nearly incompressible cells do not lock in bending.
-        mass_damping: Rayleigh's alpha [1/s]; force alpha M v.
-        stiffness_damping: Rayleigh's beta [s]; force beta K v, K the stiffness at rest. It resists
-            rigid turning too: for large rotations take `viscosity`.
-        viscosity: Kelvin and Voigt's eta [Pa s]; second Piola-Kirchhoff stress 2 eta dE/dt.
+        integration: `full`: eight points per cell. `selective`: the lambda term sees the cell's mean
+            strain only (B-bar), so nearly incompressible cells do not lock in bending.
+        mass_damping: Rayleigh coefficient alpha [1/s]; the damping force is alpha M v.
+        stiffness_damping: Rayleigh coefficient beta [s]; the damping force is beta K v, with K the stiffness
+            at rest. It also damps rigid rotation; use `viscosity` for large rotations.
+        viscosity: Kelvin-Voigt coefficient eta [Pa s]; second Piola-Kirchhoff stress 2 eta dE/dt.
 
     Raises:
-        ValueError: a name that is none of these, or a value that no material has.
+        ValueError: unknown name, or a value outside its physical range.
     """
 
     youngs_modulus: float = 215856.0
@@ -61,7 +61,7 @@ class Material:
     viscosity: float = 0.0
 
     def __post_init__(self) -> None:
-        for key, known in (("mass", MASSES), ("law", tuple(LAWS)), ("integration", INTEGRATIONS)):
+        for key, known in (("mass", MASS_MODELS), ("law", tuple(LAWS)), ("integration", INTEGRATION_SCHEMES)):
             if getattr(self, key) not in known:
                 raise ValueError(f"expected {key} to be one of {', '.join(known)}, got {getattr(self, key)!r}")
         if not (self.youngs_modulus > 0 and -1 < self.poissons_ratio < 0.5 and self.density > 0):
@@ -70,15 +70,18 @@ class Material:
                 f"got {self.youngs_modulus}, {self.density}, {self.poissons_ratio}"
             )
         if min(self.mass_damping, self.stiffness_damping, self.viscosity) < 0:
-            raise ValueError("expected mass_damping, stiffness_damping and viscosity not to be negative")
+            raise ValueError(
+                "expected mass_damping, stiffness_damping and viscosity of at least 0, "
+                f"got {self.mass_damping}, {self.stiffness_damping}, {self.viscosity}"
+            )
 
     @property
     def lame(self) -> tuple[float, float]:
-        """Lame's mu and lambda [Pa]."""
+        """Lame parameters mu and lambda [Pa]."""
         return lame(self.youngs_modulus, self.poissons_ratio)
 
     def node_volume(self, mesh: HexMesh) -> NDArray[np.float64]:
-        """What, times density, is the mass at every node [m^3], (N,)."""
+        """Mass of every node divided by the density [m^3], (N,)."""
         if self.mass == "uniform":
             return np.full(len(mesh.vertices), mesh.volumes.mean())
         rule = mesh.quadrature

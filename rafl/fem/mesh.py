@@ -1,4 +1,4 @@
-"""Hexahedral meshes: vertices, cells, quadrature and boundary."""
+"""Hexahedral meshes: vertices, cells, quadrature points and boundary."""
 
 import math
 from dataclasses import dataclass
@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+# Corner coordinates of the unit cell in node order, (8, 3).
 CORNERS = np.array([(i, j, k) for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=float)
 
-# The four corners of each side of a cell, anticlockwise seen from outside.
+# The four nodes of each side of a cell, anticlockwise as seen from outside.
 CELL_SIDES = {
     "x-min": (0, 1, 3, 2),
     "x-max": (4, 6, 7, 5),
@@ -22,11 +23,11 @@ CELL_SIDES = {
 
 
 @dataclass(frozen=True)
-class Quadrature:
+class QuadraturePoints:
     """Integration points of each cell.
 
     Attributes:
-        shape: shape functions at the points, (P points, 8 nodes); the same in every cell.
+        shape: shape functions at the points, (P points, 8 nodes); the same in node_pairs cell.
         gradient: rest-frame shape function gradients [1/m], (E, P points, 8 nodes, 3).
         volume: quadrature weight times Jacobian [m^3], (E, P points).
     """
@@ -38,11 +39,11 @@ class Quadrature:
 
 @dataclass(frozen=True)
 class HexMesh:
-    """Trilinear hexahedra.
+    """A mesh of trilinear hexahedra.
 
     Attributes:
         vertices: rest positions [m], (N, 3).
-        hexes: vertex indices of each cell, (E, 8); node (i, j, k) of a cell stands at 4i + 2j + k.
+        hexes: vertex indices of each cell, (E, 8); node (i, j, k) of a cell has index 4i + 2j + k.
     """
 
     vertices: NDArray[np.float64]
@@ -50,7 +51,7 @@ class HexMesh:
 
     @classmethod
     def box(cls, cells: ArrayLike, size: ArrayLike) -> "HexMesh":
-        """A box of `cells` (3) cells and `size` (3) [m], one corner at the origin, z fastest."""
+        """A box with `cells` (3) cells and edges `size` (3) [m]. One corner is the origin; vertices run z fastest."""
         nx, ny, nz = (int(n) for n in np.asarray(cells))
         axes = [np.linspace(0.0, s, n + 1) for s, n in zip(np.asarray(size), (nx, ny, nz), strict=True)]
         vertices = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -60,135 +61,137 @@ class HexMesh:
 
     @classmethod
     def from_grid(cls, cells: NDArray[np.bool_], size: ArrayLike) -> "HexMesh":
-        """The cells that are True in a grid (X, Y, Z), each of `size` (3) or one edge [m].
+        """The cells that are True in a grid (X, Y, Z). `size` is the edge length of a cell [m], one or three.
 
-        Vertex (0, 0, 0) of the grid is the origin; vertices run z fastest, then y, then x.
+        Vertex (0, 0, 0) of the grid is the origin. Vertices run z fastest, then y, then x.
 
         Raises:
             ValueError: no cell is True.
         """
         if not cells.any():
-            raise ValueError(f"expected at least one cell in the grid of {cells.shape}, found none")
-        whole = cls.box(cells.shape, np.array(cells.shape) * size)
-        hexes = whole.hexes[cells.ravel()]
-        used, places = np.unique(hexes, return_inverse=True)
-        return cls(whole.vertices[used], places.reshape(hexes.shape))
+            raise ValueError(f"expected at least one cell in the grid of shape {cells.shape}, got none")
+        box = cls.box(cells.shape, np.array(cells.shape) * size)
+        hexes = box.hexes[cells.ravel()]
+        used, indices = np.unique(hexes, return_inverse=True)
+        return cls(box.vertices[used], indices.reshape(hexes.shape))
 
     def scaled(self, factors: ArrayLike) -> "HexMesh":
-        """The same cells stretched by `factors` (3) along x, y, z."""
+        """The mesh scaled by `factors` (3) along x, y, z."""
         return HexMesh(self.vertices * np.asarray(factors, dtype=float), self.hexes)
 
     @cached_property
-    def quadrature(self) -> Quadrature:
-        """The 8 Gauss points at (0.5 -+ 0.5/sqrt 3), in node order.
+    def quadrature(self) -> QuadraturePoints:
+        """The 8 Gauss points at (0.5 -+ 0.5/sqrt 3) of the unit cell, in node order.
 
         Raises:
-            ValueError: a cell is inverted or flat; its index is in the message.
+            ValueError: a cell is inverted or flat; the message names its index.
         """
         points = 0.5 + (CORNERS - 0.5) / np.sqrt(3.0)
         factors = np.where(CORNERS[None] > 0.5, points[:, None], 1.0 - points[:, None])  # (P, 8, 3)
-        slopes = np.where(CORNERS > 0.5, 1.0, -1.0)
+        signs = np.where(CORNERS > 0.5, 1.0, -1.0)
         local = np.stack(
-            [slopes[:, a] * factors[:, :, (a + 1) % 3] * factors[:, :, (a + 2) % 3] for a in range(3)],
+            [signs[:, a] * factors[:, :, (a + 1) % 3] * factors[:, :, (a + 2) % 3] for a in range(3)],
             axis=-1,
         )  # (P, 8 nodes, 3)
         jacobian = np.einsum("eni,gnj->egij", self.vertices[self.hexes], local)
         determinant = np.linalg.det(jacobian)
         size = np.ptp(self.vertices[self.hexes], axis=1).max(axis=1, keepdims=True)
-        bad = determinant <= 1e-9 * size**3
-        if bad.any():
+        degenerate = determinant <= 1e-9 * size**3
+        if degenerate.any():
             worst = int(np.argmin((determinant / size**3).min(axis=1)))
             raise ValueError(
                 f"cell {worst} is inverted or flat (Jacobian {determinant[worst].min():.3g} m^3); "
                 "its eight nodes must run z fastest, then y, then x"
             )
         gradient = np.einsum("gnj,egji->egni", local, np.linalg.inv(jacobian))
-        return Quadrature(factors.prod(axis=-1), np.ascontiguousarray(gradient), determinant / len(points))
+        return QuadraturePoints(factors.prod(axis=-1), np.ascontiguousarray(gradient), determinant / len(points))
 
     @cached_property
-    def mean(self) -> Quadrature:
-        """One point a cell with the cell's mean gradient (B-bar), which affine motions leave exact.
+    def mean_quadrature(self) -> QuadraturePoints:
+        """One point per cell with the cell's mean gradient (B-bar), which is exact for affine motions.
 
         Raises:
-            ValueError: a cell is inverted or flat; its index is in the message.
+            ValueError: a cell is inverted or flat; the message names its index.
         """
         full = self.quadrature
         gradient = np.einsum("eg,egnj->enj", full.volume, full.gradient) / self.volumes[:, None, None]
-        return Quadrature(full.shape.mean(0, keepdims=True), gradient[:, None], self.volumes[:, None])
+        return QuadraturePoints(full.shape.mean(0, keepdims=True), gradient[:, None], self.volumes[:, None])
 
     @cached_property
     def volumes(self) -> NDArray[np.float64]:
         """Volume of each cell [m^3], (E,)."""
-        return self.quadrature.volume.sum(axis=1)
+        return np.asarray(self.quadrature.volume.sum(axis=1))
 
     @cached_property
     def edges(self) -> NDArray[np.int64]:
-        """Pairs of vertices that a cell's edge joins, (K, 2)."""
+        """Vertex indices of each cell edge, once per edge, (K, 2)."""
         pairs = [(a, b) for a in range(8) for b in range(a + 1, 8) if np.abs(CORNERS[a] - CORNERS[b]).sum() == 1]
-        every = np.sort(self.hexes[:, pairs].reshape(-1, 2), axis=1)
-        return np.unique(every, axis=0)
+        node_pairs = np.sort(self.hexes[:, pairs].reshape(-1, 2), axis=1)
+        return np.unique(node_pairs, axis=0)
 
     @cached_property
     def edge_lengths(self) -> NDArray[np.float64]:
-        """At rest [m], (K)."""
+        """Rest length of each edge [m], (K)."""
         first, second = self.edges.T
         return np.asarray(np.linalg.norm(self.vertices[first] - self.vertices[second], axis=1))
 
-    def stretching(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
-        """By how much of its length at rest a displacement (B, N, 3) changes the edge that it changes most, (B)."""
+    def max_edge_change(self, displacement: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Largest change of an edge vector, relative to its rest length, under displacements [m] (B, N, 3); (B)."""
         first, second = self.edges.T
         change = displacement[:, first] - displacement[:, second]
-        return np.sqrt(((change**2).sum(-1) / self.edge_lengths**2).max(axis=1))
+        return np.asarray(np.sqrt(((change**2).sum(-1) / self.edge_lengths**2).max(axis=1)))
 
-    def stretching_at_most(self, farthest: NDArray[np.float64]) -> NDArray[np.float64]:
-        """What no displacement stretches more than whose components are at most `farthest` [m], (B), sooner found."""
-        return 2.0 * math.sqrt(3.0) * farthest / self._shortest_edge
+    def max_edge_change_bound(self, largest: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Upper bound, quick to compute, of `max_edge_change` for displacement components up to `largest` [m]; (B)."""
+        return 2.0 * math.sqrt(3.0) * largest / self._shortest_edge
 
     @cached_property
     def _shortest_edge(self) -> float:
         return float(self.edge_lengths.min())
 
-    def mirrors(self, held: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether the plane across each axis (3), through the middle, maps the cells and the vertices `held` onto
-        themselves."""
+    def symmetry_planes(self, fixed: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Whether the mesh is symmetric about its mid-plane normal to each axis, (3).
+
+        The reflection must map both the cells and the vertices `fixed` onto themselves.
+        """
         low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
-        tree, own = cKDTree(self.vertices), np.unique(np.sort(self.hexes, axis=1), axis=0)
-        mapped = np.zeros(3, dtype=bool)
+        tree, cells = cKDTree(self.vertices), np.unique(np.sort(self.hexes, axis=1), axis=0)
+        symmetric = np.zeros(3, dtype=bool)
         for axis in range(3):
-            places = self.vertices.copy()
-            places[:, axis] = low[axis] + high[axis] - places[:, axis]
-            distance, image = tree.query(places)
-            mapped[axis] = (
+            reflected = self.vertices.copy()
+            reflected[:, axis] = low[axis] + high[axis] - reflected[:, axis]
+            distance, image = tree.query(reflected)
+            symmetric[axis] = (
                 distance.max() < 1e-6 * (high - low).max()
-                and np.array_equal(np.unique(np.sort(image[self.hexes], axis=1), axis=0), own)
-                and np.array_equal(np.unique(image[held]), np.unique(held))
+                and np.array_equal(np.unique(np.sort(image[self.hexes], axis=1), axis=0), cells)
+                and np.array_equal(np.unique(image[fixed]), np.unique(fixed))
             )
-        return mapped
+        return symmetric
 
     @cached_property
     def surface(self) -> NDArray[np.int64]:
-        """Boundary quads (S, 4): vertices anticlockwise seen from outside."""
+        """Boundary quads (S, 4), with vertices anticlockwise as seen from outside."""
         quads = np.concatenate([self.hexes[:, side] for side in CELL_SIDES.values()])
         _, first, counts = np.unique(np.sort(quads, axis=1), axis=0, return_index=True, return_counts=True)
-        return quads[np.sort(first[counts == 1])]
+        return np.asarray(quads[np.sort(first[counts == 1])])
 
     def face_nodes(self, face: str) -> NDArray[np.int64]:
-        """Vertices on the bounding-box face `x-min` ... `z-max`.
+        """Vertex indices on the bounding-box face `x-min` ... `z-max`.
 
         Raises:
-            ValueError: no such face.
+            ValueError: unknown face.
         """
         if face not in CELL_SIDES:
-            raise ValueError(f"expected a face among {', '.join(CELL_SIDES)}, got {face!r}")
+            raise ValueError(f"expected face to be one of {', '.join(CELL_SIDES)}, got {face!r}")
         axis = "xyz".index(face[0])
         along = self.vertices[:, axis]
-        end = along.min() if face.endswith("min") else along.max()
-        return np.flatnonzero(np.abs(along - end) < 1e-6 * np.ptp(along))
+        extreme = along.min() if face.endswith("min") else along.max()
+        return np.flatnonzero(np.abs(along - extreme) < 1e-6 * np.ptp(along))
 
     def face_quads(self, face: str) -> NDArray[np.int64]:
-        """Boundary quads (S, 4) that lie in the bounding-box face `x-min` ... `z-max`.
+        """Boundary quads (S, 4) in the bounding-box face `x-min` ... `z-max`.
 
         Raises:
-            ValueError: no such face.
+            ValueError: unknown face.
         """
         return self.surface[np.isin(self.surface, self.face_nodes(face)).all(axis=1)]

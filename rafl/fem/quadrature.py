@@ -1,4 +1,4 @@
-"""Where a cell's energy is integrated."""
+"""Quadrature rules for the elastic energy of a cell."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -6,29 +6,33 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from rafl.fem.mesh import HexMesh, Quadrature
+from rafl.fem.mesh import HexMesh, QuadraturePoints
 
 
 @dataclass(frozen=True)
-class Integration:
-    """Integration points in groups of eight, and what they carry.
+class QuadratureRule:
+    """Integration points in groups of eight, and the fraction of the moduli at each.
 
     Attributes:
-        points: shape functions, gradients and volumes of all points P, those of no weight included.
-        shares: how much of mu and of lambda the points of each group carry, (P / 8, 2).
+        points: shape functions, gradients and volumes of all P points, including padding points of volume 0.
+        group_shares: fraction of mu and of lambda that each group of points integrates, (P / 8, 2).
     """
 
-    points: Quadrature
-    shares: NDArray[np.float64]
+    points: QuadraturePoints
+    group_shares: NDArray[np.float64]
 
     @classmethod
-    def of(cls, mesh: HexMesh, name: str) -> "Integration":
-        """`full`: eight Gauss points; `selective`: lambda's part of each cell's mean strain only (B-bar)."""
+    def from_scheme(cls, mesh: HexMesh, scheme: str) -> "QuadratureRule":
+        """The rule of one of `rafl.fem.material.INTEGRATION_SCHEMES`.
+
+        `full` takes eight Gauss points. `selective` integrates mu at these points, and lambda at one point of
+        the cell's mean gradient (B-bar), padded to a group of eight.
+        """
         full = mesh.quadrature
-        if name == "full":
+        if scheme == "full":
             return cls(full, np.ones((1, 2)))
-        mean = mesh.mean
-        points = Quadrature(
+        mean = mesh.mean_quadrature
+        points = QuadraturePoints(
             np.concatenate([full.shape, np.repeat(mean.shape, 8, axis=0)]),
             np.concatenate([full.gradient, np.repeat(mean.gradient, 8, axis=1)], axis=1),
             np.concatenate([full.volume, np.pad(mean.volume, ((0, 0), (0, 7)))], axis=1),
@@ -37,11 +41,11 @@ class Integration:
 
     @property
     def point_shares(self) -> NDArray[np.float64]:
-        """How much of mu and of lambda each point carries, (P, 2)."""
-        return np.repeat(self.shares, 8, axis=0)
+        """Fraction of mu and of lambda that each point integrates, (P, 2)."""
+        return np.repeat(self.group_shares, 8, axis=0)
 
-    def stiffest(self, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A bound on the tangents' diagonal at rest [N/m], (B), of moduli (B, 5)."""
+    def max_rest_stiffness(self, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Upper bound [N/m] of the diagonal of the cells' tangents at rest, (B), for moduli (B, 5)."""
         return (2.0 * moduli[:, 0] + moduli[:, 1]) * self._stiffness_per_modulus
 
     @cached_property

@@ -1,9 +1,8 @@
-"""Arithmetic on eight doubles at a time, inside compiled kernels.
+"""SIMD arithmetic on rows of eight doubles, for use inside compiled kernels.
 
-A cell has eight Gauss points and eight nodes, so its arithmetic falls into rows of eight. LLVM finds
-such rows by itself where all indices are constants; where they are not, it must assume that arrays
-overlap, and these functions say what is meant. Any processor runs them: where its registers are
-narrower LLVM splits the rows.
+A cell has eight Gauss points and eight nodes, so its arithmetic has rows of eight. LLVM vectorises such rows
+by itself only if all indices are constants; otherwise it must assume that arrays overlap. The functions here
+emit vector instructions directly. They run on any processor: LLVM splits the rows for narrower registers.
 """
 
 from typing import Any
@@ -13,16 +12,17 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-LANES = 8
-KERNEL: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract"}}  # options of every kernel
-_ROW = ir.VectorType(ir.DoubleType(), LANES)
-_FIRST = ir.Constant(ir.IntType(32), 0)
-_EVERY_FIRST = ir.Constant(ir.VectorType(ir.IntType(32), LANES), None)
-_CONTRACT = ("contract",)  # a product and a sum may become one instruction
+SIMD_LANES = 8  # doubles in a row
+# Options of `numba.njit` for every kernel.
+KERNEL_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy", "fastmath": {"contract"}}
+_ROW = ir.VectorType(ir.DoubleType(), SIMD_LANES)
+_FIRST_LANE = ir.Constant(ir.IntType(32), 0)
+_ALL_FROM_FIRST = ir.Constant(ir.VectorType(ir.IntType(32), SIMD_LANES), None)
+_CONTRACT = ("contract",)  # allows one fused instruction for a product and a sum
 
 
 class _Rows:
-    """Builds loads and stores of rows of one array argument."""
+    """Emits loads and stores of rows of one array argument."""
 
     def __init__(self, context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> None:
         self.builder = builder
@@ -35,11 +35,11 @@ class _Rows:
     def load(self, offset: int) -> Any:
         return self.builder.load(self.builder.bitcast(self._at(offset), _ROW.as_pointer()), align=8)
 
-    def spread(self, offset: int) -> Any:
-        """One number in all lanes."""
+    def broadcast(self, offset: int) -> Any:
+        """Load one number into all SIMD lanes."""
         undefined = ir.Constant(_ROW, ir.Undefined)
-        one = self.builder.insert_element(undefined, self.builder.load(self._at(offset)), _FIRST)
-        return self.builder.shuffle_vector(one, undefined, _EVERY_FIRST)
+        one = self.builder.insert_element(undefined, self.builder.load(self._at(offset)), _FIRST_LANE)
+        return self.builder.shuffle_vector(one, undefined, _ALL_FROM_FIRST)
 
     def store(self, value: Any, offset: int) -> None:
         self.builder.store(value, self.builder.bitcast(self._at(offset), _ROW.as_pointer()), align=8)
@@ -50,8 +50,8 @@ def _add_product(builder: Any, total: Any, a: Any, b: Any) -> Any:
     return product if total is None else builder.fadd(total, product, flags=_CONTRACT)
 
 
-def _three_arrays(build: Any) -> Any:
-    """The compiled function (out, o, a, i, b, j) -> None whose body `build(builder, out, a, b)` writes."""
+def _three_array_function(build: Any) -> Any:
+    """Compiled function (out, o, a, i, b, j) -> None with the body that `build(builder, out, a, b)` emits."""
 
     @intrinsic
     def function(typing: Any, out: Any, o: Any, a: Any, i: Any, b: Any, j: Any) -> Any:
@@ -66,41 +66,49 @@ def _three_arrays(build: Any) -> Any:
     return function
 
 
-def _sum_of_products(count: int, a_stride: int, b_stride: int, *, spread: bool, add: bool) -> Any:
+def _product_sum(count: int, a_stride: int, b_stride: int, *, broadcast: bool, add: bool) -> Any:
     def build(builder: Any, out: _Rows, a: _Rows, b: _Rows) -> None:
         total = out.load(0) if add else None
         for m in range(count):
-            factor = (a.spread if spread else a.load)(m * a_stride)
+            factor = (a.broadcast if broadcast else a.load)(m * a_stride)
             total = _add_product(builder, total, factor, b.load(m * b_stride))
         out.store(total, 0)
 
-    return _three_arrays(build)
+    return _three_array_function(build)
 
 
 def weighted_rows(count: int, weight_stride: int, row_stride: int, *, add: bool = False) -> Any:
-    """Compiled (out, o, weights, i, rows, j): out[o:o+8] (+)= sum_m weights[i + m ws] rows[j + m rs: +8]."""
-    return _sum_of_products(count, weight_stride, row_stride, spread=True, add=add)
+    """Compiled function (out, o, weights, i, rows, j): a weighted sum of rows.
+
+    With sw = weight_stride, sr = row_stride and m < count, out[o:o+8] = sum_m weights[i + m sw] rows[j + m sr: +8].
+    `add` adds the sum to out instead.
+    """
+    return _product_sum(count, weight_stride, row_stride, broadcast=True, add=add)
 
 
 def lane_products(count: int, a_stride: int, b_stride: int) -> Any:
-    """Compiled (out, o, a, i, b, j): out[o:o+8] = sum_m a[i + m as: +8] b[j + m bs: +8], lane by lane."""
-    return _sum_of_products(count, a_stride, b_stride, spread=False, add=False)
+    """Compiled function (out, o, a, i, b, j): a sum of elementwise products of rows.
+
+    With sa = a_stride, sb = b_stride and m < count, out[o:o+8] = sum_m a[i + m sa: +8] * b[j + m sb: +8].
+    """
+    return _product_sum(count, a_stride, b_stride, broadcast=False, add=False)
 
 
-def add_rows(count: int) -> Any:
-    """Compiled (out, o, weights, i, rows, j, stride, n).
+def add_weighted_vectors(count: int) -> Any:
+    """Compiled function (out, o, weights, i, rows, j, stride, n): add a weighted sum of vectors.
 
-    For n places, eight at a time and up to seven more: out[o + k] += sum_m weights[i + m] rows[j + m stride + k].
+    For m < count and k < n: out[o + k] += sum_m weights[i + m] rows[j + m stride + k]. It works on blocks of
+    eight, so it also updates up to seven elements past n.
     """
 
     @intrinsic
     def function(typing: Any, out: Any, o: Any, weights: Any, i: Any, rows: Any, j: Any, stride: Any, n: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
             kinds = signature.args
-            by = _Rows(context, builder, kinds[2], args[2], args[3])
-            factors = [by.spread(m) for m in range(count)]
-            step, places = ir.Constant(args[7].type, LANES), args[7]
-            blocks = builder.sdiv(builder.add(places, ir.Constant(places.type, LANES - 1)), step)
+            weight = _Rows(context, builder, kinds[2], args[2], args[3])
+            factors = [weight.broadcast(m) for m in range(count)]
+            step, elements = ir.Constant(args[7].type, SIMD_LANES), args[7]
+            blocks = builder.sdiv(builder.add(elements, ir.Constant(elements.type, SIMD_LANES - 1)), step)
             with cgutils.for_range(builder, blocks) as loop:
                 shift = builder.mul(loop.index, step)
                 target = _Rows(context, builder, kinds[0], args[0], builder.add(args[1], shift))
@@ -118,15 +126,15 @@ def add_rows(count: int) -> Any:
 
 
 def transposed_product(count: int) -> Any:
-    """Compiled (out, o, a, i, b, j): out (8, 8) += a^T b for a, b (count, 8), all row after row."""
+    """Compiled function (out, o, a, i, b, j): out (8, 8) += a^T b for a, b (count, 8), all in row-major order."""
 
     def build(builder: Any, out: _Rows, a: _Rows, b: _Rows) -> None:
-        totals = [out.load(LANES * n) for n in range(LANES)]
+        totals = [out.load(SIMD_LANES * n) for n in range(SIMD_LANES)]
         for m in range(count):
-            row = b.load(LANES * m)
-            for n in range(LANES):
-                totals[n] = _add_product(builder, totals[n], a.spread(LANES * m + n), row)
-        for n in range(LANES):
-            out.store(totals[n], LANES * n)
+            row = b.load(SIMD_LANES * m)
+            for n in range(SIMD_LANES):
+                totals[n] = _add_product(builder, totals[n], a.broadcast(SIMD_LANES * m + n), row)
+        for n in range(SIMD_LANES):
+            out.store(totals[n], SIMD_LANES * n)
 
-    return _three_arrays(build)
+    return _three_array_function(build)

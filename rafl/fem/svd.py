@@ -1,20 +1,22 @@
-"""Singular value decompositions with rotations on both sides."""
+"""Singular value decompositions of 3 x 3 matrices into two rotations and signed singular values."""
 
 import numpy as np
 from numba import njit
 
 from rafl.fem.kernel_layout import DEFORMATION, STRETCH, TEMPORARY, U, V
-from rafl.fem.simd import KERNEL
+from rafl.fem.simd import KERNEL_OPTIONS
 
-SAFE_DETERMINANT = 0.05  # below it a lane is decomposed on its own, with care
-TINY = 1e-100  # of the largest stretch: the square of a smaller one is rounded to few digits, or to nought
+MIN_BATCH_DETERMINANT = 0.05  # det F; at or below it `signed_svd` decomposes the matrix on its own
+# Ratio of the second stretch to the largest. The square of a smaller stretch loses digits or underflows to zero.
+MIN_RELATIVE_STRETCH = 1e-100
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def signed_svd(F, U, s, V):
-    """F = U diag(s) V^T by one-sided Jacobi; U, V rotations, s descending, only s[2] may be negative.
+    """Compute F = U diag(s) V^T by one-sided Jacobi, with rotations U and V.
 
-    F (3, 3) is read; U (3, 3), s (3), V (3, 3) are filled. Repeated stretches are no special case.
+    s (3) is descending and only s[2] may be negative. F (3, 3) is read; U (3, 3), s and V (3, 3) are filled.
+    Repeated stretches need no special case.
     """
     B = U
     for i in range(3):
@@ -22,7 +24,7 @@ def signed_svd(F, U, s, V):
             B[i, j] = F[i, j]
             V[i, j] = 1.0 if i == j else 0.0
     for _ in range(30):
-        off = 0.0
+        off_diagonal = 0.0
         for p in range(2):
             for r in range(p + 1, 3):
                 a = B[0, p] * B[0, p] + B[1, p] * B[1, p] + B[2, p] * B[2, p]
@@ -31,7 +33,7 @@ def signed_svd(F, U, s, V):
                 size = np.sqrt(a) * np.sqrt(b)
                 if abs(c) <= 1e-17 * size or size < 1e-150:
                     continue
-                off = max(off, abs(c) / size)
+                off_diagonal = max(off_diagonal, abs(c) / size)
                 zeta = (b - a) / (2.0 * c)
                 t = (1.0 if zeta >= 0.0 else -1.0) / (abs(zeta) + np.sqrt(1.0 + zeta * zeta))
                 cos = 1.0 / np.sqrt(1.0 + t * t)
@@ -45,14 +47,14 @@ def signed_svd(F, U, s, V):
                     y = V[i, r]
                     V[i, p] = cos * x - sin * y
                     V[i, r] = sin * x + cos * y
-        if off < 1e-15:
+        if off_diagonal < 1e-15:
             break
     for i in range(3):
         s[i] = np.sqrt(B[0, i] * B[0, i] + B[1, i] * B[1, i] + B[2, i] * B[2, i])
     for p, r in ((0, 1), (1, 2), (0, 1)):
         if s[p] < s[r]:
             s[p], s[r] = s[r], s[p]
-            for i in range(3):  # swap with one sign change, so that V stays a rotation
+            for i in range(3):  # swap columns and negate one, so that V stays a rotation
                 x = B[i, p]
                 B[i, p] = B[i, r]
                 B[i, r] = -x
@@ -62,10 +64,10 @@ def signed_svd(F, U, s, V):
     for i in range(3):
         B[i, 0] /= s[0]
     along = B[0, 0] * B[0, 1] + B[1, 0] * B[1, 1] + B[2, 0] * B[2, 1]
-    if s[1] > TINY * s[0] and abs(along) < 1e-8 * s[1]:
+    if s[1] > MIN_RELATIVE_STRETCH * s[0] and abs(along) < 1e-8 * s[1]:
         for i in range(3):
             B[i, 1] /= s[1]
-    else:  # rank one, the second column nought or rounding: any direction across the first serves
+    else:  # rank one: the second column is zero or rounding error; take any direction normal to the first
         k = 0
         for i in range(3):
             if abs(B[i, 0]) < abs(B[k, 0]):
@@ -84,11 +86,11 @@ def signed_svd(F, U, s, V):
     B[2, 2] = z
 
 
-@njit(**KERNEL)
-def signed_svd_lanes(w):
-    """`signed_svd` of the scratch's eight deformation gradients at once.
+@njit(**KERNEL_OPTIONS)
+def signed_svd_simd(w):
+    """Decompose the eight deformation gradients of the scratch array at once.
 
-    Stretches come in any order; one is negative only where the determinant is.
+    Fills U, STRETCH and V. Stretches are in any order; one of them is negative only if det F is.
     """
     for r in range(9):
         for g in range(8):
@@ -115,10 +117,10 @@ def signed_svd_lanes(w):
                 cos = 1.0 / np.sqrt(1.0 + t * t)
                 w[TEMPORARY * 8 + g] = cos
                 w[(TEMPORARY + 1) * 8 + g] = cos * t
-                # Down to rounding: where stretches repeat, a sweep from afar need not be the last.
-                off = c * c - 1e-30 * a * b
+                # Iterate down to rounding: with repeated stretches, one sweep need not suffice.
+                off_diagonal = c * c - 1e-30 * a * b
                 largest = w[(TEMPORARY + 2) * 8 + g]
-                w[(TEMPORARY + 2) * 8 + g] = off if off > largest else largest
+                w[(TEMPORARY + 2) * 8 + g] = off_diagonal if off_diagonal > largest else largest
             for i in range(6):  # three rows of U, then three of V
                 for g in range(8):
                     cos = w[TEMPORARY * 8 + g]
@@ -159,12 +161,13 @@ def signed_svd_lanes(w):
         w[(U + 5) * 8 + g] = c1 / c
         w[(U + 8) * 8 + g] = c2 / c
     for g in range(8):
-        if not w[(TEMPORARY + 2) * 8 + g] > SAFE_DETERMINANT:
+        if not w[(TEMPORARY + 2) * 8 + g] > MIN_BATCH_DETERMINANT:
             _decompose_lane(w, g)
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def _decompose_lane(w, g):
+    """Decompose the deformation gradient of SIMD lane g with `signed_svd`."""
     F = np.empty((3, 3))
     left = np.empty((3, 3))
     right = np.empty((3, 3))

@@ -1,1 +1,1 @@
-"""Direct and iterative solvers of the simulator's linear systems."""
+"""Direct and iterative solvers for the simulator's linear systems."""

@@ -1,7 +1,8 @@
-"""What linear solvers of the tangent systems promise, and what they share.
+"""Interface and shared parts of the linear solvers for tangent systems.
 
-A matrix comes as the cells' stiffnesses and a diagonal over the free unknowns. Solvers `allocate` room for
-a batch of factors, `factor` some of its rows, and `solve` with them.
+A matrix is given by the cell stiffnesses and a diagonal over the free unknowns. A solver allocates storage for the
+factors of a batch, factors some rows of the batch, and solves with them. Shapes: B trajectories in the batch, R of
+them in one call, C right-hand sides for each, n unknowns, E cells.
 """
 
 from dataclasses import dataclass
@@ -20,11 +21,11 @@ Array = NDArray[Any]
 
 @dataclass
 class Factors:
-    """Factors of a batch of matrices, kept from one Newton step to the next.
+    """Factors of a batch of matrices, which can be reused in later Newton steps.
 
     Attributes:
-        storage: whatever the solver fills, by trajectory.
-        ready: which of them can be used, (B).
+        storage: the solver's own data, indexed by trajectory.
+        ready: whether each trajectory has a usable factor, (B).
     """
 
     storage: Any
@@ -32,50 +33,53 @@ class Factors:
 
 
 class LinearSolver(Protocol):
-    """Factors and solves tangent systems over the free unknowns of one mesh."""
+    """Solver for tangent systems over the free unknowns of one mesh."""
 
     free_index: NDArray[np.int64]
-    unknowns: "Unknowns"
-    patience: float  # how many steps with an old factor cost as much as a new one
+    unknowns: "FreeUnknowns"
+    factorisation_cost: float  # of a new factor, in Newton steps with an old factor
 
     def allocate(self, batch: int) -> Factors:
-        """Room for the factors of a batch."""
+        """Storage for the factors of a batch."""
 
     def factor(self, factors: Factors, rows: Array, stiffness: Array, diagonal: Array) -> NDArray[np.bool_]:
-        """Factor `rows` of the batch; True where the matrix was positive definite."""
+        """Factor `rows` (R) of the batch; True where the matrix is positive definite.
+
+        stiffness: (R, E, 6, 8, 8) [N/m], lower blocks as from `rafl.fem.elements.element_terms`. diagonal: (R, n).
+        """
 
     def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
-        """Solutions (R, C, n) of right sides (R, C, n)."""
+        """Solutions (R, C, n) for right-hand sides (R, C, n), with the factors of `rows`."""
 
     def solve_indefinite(self, stiffness: Array, diagonal: Array, right: Array) -> Array:
-        """Solutions (C, n) of one trajectory's system that no Cholesky factor exists for."""
+        """Solutions (C, n) of one trajectory's system whose matrix is not positive definite."""
 
 
-class Unknowns:
-    """Numbering of the free nodes' unknowns, and where the cells' entries belong.
+class FreeUnknowns:
+    """Numbering of the unknowns (components of the free nodes) and matrix positions of the cell stiffnesses.
 
     Attributes:
-        order: free nodes in the order of their unknowns.
-        free_index: flat indices into (N * 3) of the unknowns, in order, (n).
-        entries: which of the cells' (E * 384) entries count: neither held nor there twice, (M).
-        rows, columns: of those entries, row >= column, (M).
+        order: free nodes, in the order of their unknowns.
+        free_index: flat index into (N * 3) of each unknown, (n).
+        entries: indices into the cell stiffnesses (E * 384): those of free nodes, each symmetric pair once, (M).
+        rows, columns: matrix positions of these entries, with row >= column, (M).
     """
 
     def __init__(self, mesh: HexMesh, order: NDArray[np.int64]) -> None:
         self.order = order
         self.free_index = (3 * order[:, None] + np.arange(3)).ravel()
-        first = np.full(len(mesh.vertices), -1, dtype=np.int64)
-        first[order] = 3 * np.arange(len(order))
-        at = first[mesh.hexes]  # (E, 8)
+        unknown_of_node = np.full(len(mesh.vertices), -1, dtype=np.int64)
+        unknown_of_node[order] = 3 * np.arange(len(order))
+        first_unknowns = unknown_of_node[mesh.hexes]  # (E, 8)
         rows, columns = [], []
         for i in range(3):
             for k in range(i + 1):
-                row, column = np.broadcast_arrays(at[:, :, None] + i, at[:, None, :] + k)
-                counts = (at[:, :, None] >= 0) & (at[:, None, :] >= 0)
+                row, column = np.broadcast_arrays(first_unknowns[:, :, None] + i, first_unknowns[:, None, :] + k)
+                kept = (first_unknowns[:, :, None] >= 0) & (first_unknowns[:, None, :] >= 0)
                 if i == k:
-                    counts = counts & np.tri(8, dtype=bool)
-                rows.append(np.where(counts, np.maximum(row, column), -1).reshape(len(at), 64))
-                columns.append(np.where(counts, np.minimum(row, column), -1).reshape(len(at), 64))
+                    kept = kept & np.tri(8, dtype=bool)
+                rows.append(np.where(kept, np.maximum(row, column), -1).reshape(len(first_unknowns), 64))
+                columns.append(np.where(kept, np.minimum(row, column), -1).reshape(len(first_unknowns), 64))
         flat = np.concatenate(rows, axis=1).ravel()
         self.entries = np.flatnonzero(flat >= 0)
         self.rows = flat[self.entries]
@@ -87,12 +91,12 @@ class Unknowns:
         return len(self.free_index)
 
     @cached_property
-    def width(self) -> int:
-        """Bandwidth, the diagonal included."""
+    def bandwidth(self) -> int:
+        """Bandwidth, including the diagonal."""
         return int((self.rows - self.columns).max()) + 1
 
-    def sparse(self, stiffness: Array, diagonal: Array) -> csr_array:
-        """One trajectory's matrix, both triangles."""
+    def sparse_matrix(self, stiffness: Array, diagonal: Array) -> csr_array:
+        """Full symmetric matrix of one trajectory."""
         values = stiffness.reshape(-1)[self.entries]
         lower = coo_array((values, (self.rows, self.columns)), shape=(self.count, self.count)).tocsr()
         lower.setdiag(0.5 * (lower.diagonal() + diagonal))
@@ -100,7 +104,7 @@ class Unknowns:
 
 
 def node_graph(mesh: HexMesh, free: NDArray[np.int64]) -> csr_array:
-    """Which free nodes share a cell, by their places in `free`."""
+    """Adjacency of the free nodes: nodes of one cell are adjacent. Rows and columns index `free`."""
     rows = np.repeat(mesh.hexes, 8, axis=1).ravel()
     columns = np.tile(mesh.hexes, (1, 8)).ravel()
     shape = (len(mesh.vertices),) * 2
@@ -108,10 +112,10 @@ def node_graph(mesh: HexMesh, free: NDArray[np.int64]) -> csr_array:
 
 
 def free_nodes(mesh: HexMesh, fixed: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes that are not held, in order."""
+    """Nodes that are not fixed, in ascending order."""
     return np.setdiff1d(np.arange(len(mesh.vertices)), fixed)
 
 
-def solve_by_pivoting(unknowns: Unknowns, stiffness: Array, diagonal: Array, right: Array) -> Array:
-    """Solutions (C, n) of right sides (C, n) with one trajectory's matrix, definite or not."""
-    return splu(unknowns.sparse(stiffness, diagonal).tocsc()).solve(right.T).T
+def solve_by_sparse_lu(unknowns: FreeUnknowns, stiffness: Array, diagonal: Array, right: Array) -> Array:
+    """Solutions (C, n) for right-hand sides (C, n) of one trajectory, by LU factors; the matrix may be indefinite."""
+    return np.asarray(splu(unknowns.sparse_matrix(stiffness, diagonal).tocsc()).solve(right.T).T)

@@ -1,11 +1,11 @@
-"""Elastic laws, one a file: energy densities of the principal stretches, linear in mu and lambda.
+"""Elastic laws, one per module: energy densities of the principal stretches, linear in mu and lambda.
 
-Each has `derivatives` for the kernels, `plain_derivatives` in tensors, and `rest_lame`.
+Each module has `derivatives` for the compiled kernels, `reference_derivatives` on tensors, and `rest_lame`.
 """
 
 from types import ModuleType
 
 from rafl.fem.laws import corotated, neo_hookean, projective
 
-# In the order of the numbers that kernels know them by.
+# Kernels identify a law by its index in this order.
 LAWS: dict[str, ModuleType] = {"projective": projective, "corotated": corotated, "neo-hookean": neo_hookean}

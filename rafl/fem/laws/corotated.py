@@ -1,21 +1,21 @@
-"""Linear corotated elasticity: psi(F) = mu |F - R|^2 + (lambda / 2) tr^2(R^T F - I), R the polar rotation."""
+"""Linear corotated elasticity: psi(F) = mu |F - R|^2 + (lambda / 2) tr^2(R^T F - I), with polar rotation R."""
 
 import torch
 from numba import njit
 from torch import Tensor
 
 from rafl.fem.kernel_layout import ENERGY, FIRST, FLIP, SECOND, STRETCH
-from rafl.fem.simd import KERNEL
+from rafl.fem.simd import KERNEL_OPTIONS
 
 
 def rest_lame(mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
-    """Lame parameters of the linear elasticity this law starts with."""
+    """Lame parameters of the law's linearisation at rest."""
     return mu, lam
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def derivatives(w, mu, lam):
-    """Energy density and its derivatives at the scratch's stretches; see `rafl.fem.kernel_layout`."""
+    """Fill ENERGY, FIRST, SECOND and FLIP from the stretches; see `rafl.fem.kernel_layout`."""
     for g in range(8):
         e0 = w[STRETCH * 8 + g] - 1.0
         e1 = w[(STRETCH + 1) * 8 + g] - 1.0
@@ -32,8 +32,8 @@ def derivatives(w, mu, lam):
             w[(FLIP + i) * 8 + g] = 2.0 * mu
 
 
-def plain_derivatives(s: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The same in plain words: energy (...), first (..., 3), second (..., 3, 3), flip (..., 3) at s (..., 3)."""
+def reference_derivatives(s: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`derivatives` on tensors s (..., 3): energy (...), first (..., 3), second (..., 3, 3), flip (..., 3)."""
     mu, lam = mu[..., None], lam[..., None]
     trace = (s - 1.0).sum(-1, keepdim=True)
     energy = (mu * (s - 1.0) ** 2).sum(-1) + (0.5 * lam * trace**2)[..., 0]

@@ -1,7 +1,7 @@
 """Stable neo-Hookean rubber: psi(F) = mu/2 (|F|^2 - 3) - mu (J - 1) + (mu + lambda)/2 (J - 1)^2, J = det F.
 
-Finite where a cell turns inside out, and at rest the linear elasticity of (mu, lambda). After Smith,
-De Goes and Kim, Stable Neo-Hookean Flesh Simulation (2018), without its logarithm.
+The energy stays finite for inverted cells; at rest the law is linear elasticity with mu and lambda. Source:
+Smith, De Goes and Kim, Stable Neo-Hookean Flesh Simulation (2018), without the logarithmic term.
 """
 
 import torch
@@ -9,20 +9,20 @@ from numba import njit
 from torch import Tensor
 
 from rafl.fem.kernel_layout import ENERGY, FIRST, FLIP, SECOND, STRETCH
-from rafl.fem.simd import KERNEL
+from rafl.fem.simd import KERNEL_OPTIONS
 
 
 def rest_lame(mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
-    """Lame parameters of the linear elasticity this law starts with."""
+    """Lame parameters of the law's linearisation at rest."""
     return mu, lam
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def derivatives(w, mu, lam):
-    """Energy density and its derivatives at the scratch's stretches; see `rafl.fem.kernel_layout`."""
+    """Fill ENERGY, FIRST, SECOND and FLIP from the stretches; see `rafl.fem.kernel_layout`."""
     bulk = mu + lam
     for g in range(8):
-        # In e = s - 1, so that nothing large cancels near rest.
+        # In terms of e = s - 1, to avoid cancellation near rest.
         s0 = w[STRETCH * 8 + g]
         s1 = w[(STRETCH + 1) * 8 + g]
         s2 = w[(STRETCH + 2) * 8 + g]
@@ -32,14 +32,14 @@ def derivatives(w, mu, lam):
         a0 = s1 * s2
         a1 = s2 * s0
         a2 = s0 * s1
-        bend = e0 * e1 + e1 * e2 + e2 * e0 + e0 * e1 * e2
-        growth = e0 + e1 + e2 + bend
-        pressure = bulk * growth - mu
+        higher_order = e0 * e1 + e1 * e2 + e2 * e0 + e0 * e1 * e2
+        volume_change = e0 + e1 + e2 + higher_order
+        pressure = bulk * volume_change - mu
         square = 0.5 * (e0 * e0 + e1 * e1 + e2 * e2)
-        w[ENERGY * 8 + g] = mu * (square - bend) + 0.5 * bulk * growth * growth
-        w[FIRST * 8 + g] = mu * (e0 - e1 - e2 - e1 * e2) + bulk * growth * a0
-        w[(FIRST + 1) * 8 + g] = mu * (e1 - e2 - e0 - e2 * e0) + bulk * growth * a1
-        w[(FIRST + 2) * 8 + g] = mu * (e2 - e0 - e1 - e0 * e1) + bulk * growth * a2
+        w[ENERGY * 8 + g] = mu * (square - higher_order) + 0.5 * bulk * volume_change * volume_change
+        w[FIRST * 8 + g] = mu * (e0 - e1 - e2 - e1 * e2) + bulk * volume_change * a0
+        w[(FIRST + 1) * 8 + g] = mu * (e1 - e2 - e0 - e2 * e0) + bulk * volume_change * a1
+        w[(FIRST + 2) * 8 + g] = mu * (e2 - e0 - e1 - e0 * e1) + bulk * volume_change * a2
         w[SECOND * 8 + g] = mu + bulk * a0 * a0
         w[(SECOND + 1) * 8 + g] = mu + bulk * a1 * a1
         w[(SECOND + 2) * 8 + g] = mu + bulk * a2 * a2
@@ -51,23 +51,23 @@ def derivatives(w, mu, lam):
         w[(FLIP + 2) * 8 + g] = mu - pressure * s1
 
 
-def plain_derivatives(s: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The same in plain words: energy (...), first (..., 3), second (..., 3, 3), flip (..., 3) at s (..., 3)."""
+def reference_derivatives(s: Tensor, mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """`derivatives` on tensors s (..., 3): energy (...), first (..., 3), second (..., 3, 3), flip (..., 3)."""
     mu, lam = mu[..., None], lam[..., None]
     next_, after = s.roll(-1, -1), s.roll(-2, -1)
     area = next_ * after  # d J / d s
-    growth = s.prod(-1, keepdim=True) - 1.0
-    pressure = (mu + lam) * growth - mu
-    energy = 0.5 * mu * ((s**2).sum(-1, keepdim=True) - 3.0) - mu * growth + 0.5 * (mu + lam) * growth**2
+    volume_change = s.prod(-1, keepdim=True) - 1.0
+    pressure = (mu + lam) * volume_change - mu
+    energy = 0.5 * mu * ((s**2).sum(-1, keepdim=True) - 3.0) - mu * volume_change + 0.5 * (mu + lam) * volume_change**2
     identity = torch.eye(3, dtype=s.dtype, device=s.device)
-    # d^2 J / ds_i ds_j is the third stretch.
+    # d^2 J / ds_i ds_j (i != j) is the remaining stretch.
     zero = torch.zeros_like(s[..., 0])
-    third = torch.stack(
+    jacobian_hessian = torch.stack(
         [zero, s[..., 2], s[..., 1], s[..., 2], zero, s[..., 0], s[..., 1], s[..., 0], zero], dim=-1
     ).reshape(*s.shape, 3)
     second = (
         mu[..., None] * identity
         + (mu + lam)[..., None] * area[..., :, None] * area[..., None, :]
-        + pressure[..., None] * third
+        + pressure[..., None] * jacobian_hessian
     )
     return energy[..., 0], mu * s + pressure * area, second, mu - pressure * after

@@ -5,15 +5,15 @@ from rafl.fem.material import Material, lame
 from rafl.fem.mesh import HexMesh
 
 
-def skewed() -> HexMesh:
-    """A sheared and tapered block: no cell is a box."""
+def tapered_block() -> HexMesh:
+    """A sheared and tapered block, in which no cell is a box."""
     mesh = HexMesh.box((3, 2, 2), (0.3, 0.2, 0.2))
     x, y, z = mesh.vertices.T
     return HexMesh(np.stack([x + 0.2 * z, y * (1 + 0.5 * x), z + 0.1 * x * y], axis=1), mesh.hexes)
 
 
 def test_volume_of_a_tapered_block() -> None:
-    """The mean Jacobian of the map (x + 0.2 z, y (1 + x / 2), z + 0.1 x y), by 216,000 points."""
+    """Exact volume: mean Jacobian of the map (x + 0.2 z, y (1 + x / 2), z + 0.1 x y), at 216,000 points."""
     n = 60
     grid = (np.arange(n) + 0.5) / n
     x, y, _ = np.meshgrid(0.3 * grid, 0.2 * grid, 0.2 * grid, indexing="ij")
@@ -22,20 +22,20 @@ def test_volume_of_a_tapered_block() -> None:
     jacobian[..., 1, 0], jacobian[..., 1, 1] = 0.5 * y, 1 + 0.5 * x
     jacobian[..., 2, 0], jacobian[..., 2, 1], jacobian[..., 2, 2] = 0.1 * y, 0.1 * x, 1.0
     exact = np.linalg.det(jacobian).mean() * 0.3 * 0.2 * 0.2
-    coarse = skewed().volumes.sum()
-    assert coarse == pytest.approx(exact, rel=2e-3)
+    volume = tapered_block().volumes.sum()
+    assert volume == pytest.approx(exact, rel=2e-3)
 
 
 def test_gradients_reproduce_linear_fields() -> None:
-    """On any cell shape the gradient of A x + b is A."""
-    mesh = skewed()
+    """The gradient of A x + b is A in cells of any shape."""
+    mesh = tapered_block()
     a = np.array([[1.0, 2.0, -1.0], [0.3, -0.7, 0.2], [2.0, 0.1, 1.5]])
     field = mesh.vertices @ a.T + 3.0
     gradient = np.einsum("eni,egnj->egij", field[mesh.hexes], mesh.quadrature.gradient)
     np.testing.assert_allclose(gradient, np.broadcast_to(a, gradient.shape), atol=1e-12)
 
 
-def test_an_inverted_cell_is_refused_by_index() -> None:
+def test_error_names_the_distorted_cell() -> None:
     mesh = HexMesh.box((3, 1, 1), (3.0, 1.0, 1.0))
     vertices = mesh.vertices.copy()
     vertices[mesh.hexes[1][4:]] -= [1.5, 0, 0]
@@ -43,8 +43,8 @@ def test_an_inverted_cell_is_refused_by_index() -> None:
         _ = HexMesh(vertices, mesh.hexes).quadrature
 
 
-def test_surface_is_closed_and_points_outwards() -> None:
-    """Area vectors of a closed surface add up to zero; x . n / 3 over it is the volume."""
+def test_surface_is_closed_with_outward_normals() -> None:
+    """Area vectors of a closed surface sum to zero. The integral of x . n / 3 is the volume."""
     mesh = HexMesh.box((3, 2, 2), (0.3, 0.2, 0.1))
     corners = mesh.vertices[mesh.surface]
     area = 0.5 * np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
@@ -61,15 +61,15 @@ def test_face_nodes() -> None:
         mesh.face_nodes("left")
 
 
-def test_masses() -> None:
-    """Lumped mass is the true one; the paper's gives every node a whole cell's."""
+def test_mass_models() -> None:
+    """The lumped model has the true mass. The uniform model of the paper gives every node the mass of a whole cell."""
     mesh = HexMesh.box((10, 3, 3), (0.1, 0.03, 0.03))
     assert Material(mass="lumped").node_volume(mesh).sum() == pytest.approx(9e-5)
     assert 1070 * Material(mass="uniform").node_volume(mesh).sum() == pytest.approx(0.18832)
 
 
-def test_cells_from_a_grid_and_stretched() -> None:
-    """An L of three cells: 16 vertices, z fastest; stretching multiplies the volume."""
+def test_mesh_from_grid_and_scaling() -> None:
+    """Three cells in an L have 16 vertices, z fastest. Scaling multiplies the volume."""
     cells = np.zeros((2, 2, 1), dtype=bool)
     cells[0], cells[1, 0] = True, True
     mesh = HexMesh.from_grid(cells, 0.01).scaled([2.0, 1.0, 1.5])
@@ -81,42 +81,42 @@ def test_cells_from_a_grid_and_stretched() -> None:
         HexMesh.from_grid(np.zeros((2, 2, 2), dtype=bool), 0.01)
 
 
-def test_a_whole_grid_is_the_box() -> None:
+def test_full_grid_equals_the_box() -> None:
     grid, box = HexMesh.from_grid(np.ones((3, 2, 2), dtype=bool), 0.01), HexMesh.box((3, 2, 2), (0.03, 0.02, 0.02))
     np.testing.assert_allclose(grid.vertices, box.vertices)
     np.testing.assert_array_equal(grid.hexes, box.hexes)
 
 
-def test_planes_of_symmetry() -> None:
+def test_symmetry_planes() -> None:
     mesh = HexMesh.box((3, 2, 2), (0.03, 0.02, 0.01))
-    nothing = np.array([], dtype=np.int64)
-    assert mesh.mirrors(nothing).tolist() == [True, True, True]
-    assert mesh.mirrors(mesh.face_nodes("x-min")).tolist() == [False, True, True]
-    assert mesh.mirrors(mesh.face_nodes("x-min")[:2]).tolist() == [False, False, False]
+    no_nodes = np.array([], dtype=np.int64)
+    assert mesh.symmetry_planes(no_nodes).tolist() == [True, True, True]
+    assert mesh.symmetry_planes(mesh.face_nodes("x-min")).tolist() == [False, True, True]
+    assert mesh.symmetry_planes(mesh.face_nodes("x-min")[:2]).tolist() == [False, False, False]
     cells = np.ones((3, 2, 2), dtype=bool)
     cells[2, :, 1] = False
     notched = HexMesh.from_grid(cells, 0.01)
-    assert notched.mirrors(nothing).tolist() == [False, True, False]
+    assert notched.symmetry_planes(no_nodes).tolist() == [False, True, False]
     bent = notched.vertices + 1e-4 * notched.vertices[:, [1]]
-    assert HexMesh(bent, notched.hexes).mirrors(nothing).tolist() == [False, False, False]
+    assert HexMesh(bent, notched.hexes).symmetry_planes(no_nodes).tolist() == [False, False, False]
 
 
-def test_edges_stretch() -> None:
-    """A pull of 10 % along x; nodes that move apart by a known way; never more than the quick bound says."""
+def test_max_edge_change_and_its_bound() -> None:
+    """A stretch by 10 % along x, one displaced node, and random displacements, which must stay below the bound."""
     mesh = HexMesh.box((3, 2, 2), (0.06, 0.02, 0.01))
-    pulled = 0.1 * mesh.vertices * [1.0, 0.0, 0.0]
-    alone = np.zeros_like(mesh.vertices)
-    alone[0] = [0.001, 0.002, -0.002]
-    both = np.stack([pulled, alone])
-    np.testing.assert_allclose(mesh.stretching(both), [0.1, 0.003 / 0.005])
+    stretched = 0.1 * mesh.vertices * [1.0, 0.0, 0.0]
+    single_node = np.zeros_like(mesh.vertices)
+    single_node[0] = [0.001, 0.002, -0.002]
+    displacements = np.stack([stretched, single_node])
+    np.testing.assert_allclose(mesh.max_edge_change(displacements), [0.1, 0.003 / 0.005])
     random = np.random.default_rng(3).uniform(-1e-3, 1e-3, (50, *mesh.vertices.shape))
-    assert (mesh.stretching(random) <= mesh.stretching_at_most(np.abs(random).max(axis=(1, 2)))).all()
-    apart = np.where(mesh.vertices.sum(axis=1, keepdims=True) > 0.03, 1e-3, -1e-3) * np.ones(3)
-    assert mesh.stretching_at_most(np.array([1e-3])) == pytest.approx(mesh.stretching(apart[None]))
+    assert (mesh.max_edge_change(random) <= mesh.max_edge_change_bound(np.abs(random).max(axis=(1, 2)))).all()
+    opposite = np.where(mesh.vertices.sum(axis=1, keepdims=True) > 0.03, 1e-3, -1e-3) * np.ones(3)
+    assert mesh.max_edge_change_bound(np.array([1e-3])) == pytest.approx(mesh.max_edge_change(opposite[None]))
 
 
 @pytest.mark.parametrize("damage", ["inverted", "flat"])
-def test_bad_cells_are_refused_by_index(damage: str) -> None:
+def test_error_names_the_inverted_or_flat_cell(damage: str) -> None:
     mesh = HexMesh.box((3, 1, 1), (0.03, 0.01, 0.01))
     vertices, hexes = mesh.vertices.copy(), mesh.hexes.copy()
     if damage == "inverted":
@@ -128,7 +128,7 @@ def test_bad_cells_are_refused_by_index(damage: str) -> None:
         _ = HexMesh(vertices, hexes).quadrature
 
 
-def test_lame() -> None:
+def test_lame_parameters() -> None:
     mu, lam = lame(2.5, 0.25)
     assert mu == pytest.approx(1.0)
     assert lam == pytest.approx(1.0)

@@ -4,7 +4,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rafl.fem.kernel_layout import DEFORMATION, ROWS, STRETCH, U, V
-from rafl.fem.svd import signed_svd, signed_svd_lanes
+from rafl.fem.svd import signed_svd, signed_svd_simd
 
 
 def svd(F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -13,18 +13,18 @@ def svd(F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return left, s, right
 
 
-def svd_of_eight(F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of F (8, 3, 3), by the kernel that takes them all at once."""
+def simd_svd(F: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """SVD of F (8, 3, 3) by the SIMD kernel, which takes all eight at once."""
     w = np.zeros((ROWS, 8))
     w[DEFORMATION : DEFORMATION + 9] = F.reshape(8, 9).T
-    signed_svd_lanes(w.reshape(-1))
-    left, right = (w[at : at + 9].T.reshape(8, 3, 3) for at in (U, V))
+    signed_svd_simd(w.reshape(-1))
+    left, right = (w[offset : offset + 9].T.reshape(8, 3, 3) for offset in (U, V))
     return left, w[STRETCH : STRETCH + 3].T, right
 
 
 @settings(deadline=None, max_examples=200)
 @given(st.lists(st.floats(-2, 2), min_size=9, max_size=9))
-def test_signed_svd(entries: list[float]) -> None:
+def test_signed_svd_factors_random_matrices(entries: list[float]) -> None:
     F = np.array(entries).reshape(3, 3)
     if np.linalg.norm(F) < 1e-3:
         return
@@ -37,7 +37,7 @@ def test_signed_svd(entries: list[float]) -> None:
     np.testing.assert_allclose(np.abs(s), np.linalg.svd(F, compute_uv=False), atol=1e-12)
 
 
-def test_svd_of_special_matrices() -> None:
+def test_signed_svd_of_degenerate_matrices() -> None:
     one_row = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.6423473344796382, 0.5]])
     tiny = np.array([[0.0, 9.8e-160, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     flat = np.diag([1.0, 0.0, 0.0])
@@ -48,13 +48,13 @@ def test_svd_of_special_matrices() -> None:
         assert np.linalg.det(left) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3, 0.3, 2.0])
-def test_eight_at_once(size: float, random: np.random.Generator) -> None:
-    """From exact rest (repeated stretches) to inversion; each lane is as good as one alone."""
+@pytest.mark.parametrize("scale", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-3, 0.3, 2.0])
+def test_signed_svd_simd(scale: float, random: np.random.Generator) -> None:
+    """From exact rest, with repeated stretches, to inversion: every SIMD lane is accurate to rounding."""
     for _ in range(200):
-        F = np.eye(3) + size * random.normal(size=(8, 3, 3))
-        left, s, right = svd_of_eight(F)
-        np.testing.assert_allclose(left * s[:, None] @ right.swapaxes(1, 2), F, atol=1e-14 * (1 + size))
+        F = np.eye(3) + scale * random.normal(size=(8, 3, 3))
+        left, s, right = simd_svd(F)
+        np.testing.assert_allclose(left * s[:, None] @ right.swapaxes(1, 2), F, atol=1e-14 * (1 + scale))
         for rotation in (left, right):
             product = rotation @ rotation.swapaxes(1, 2)
             np.testing.assert_allclose(product, np.broadcast_to(np.eye(3), F.shape), atol=4e-15)
