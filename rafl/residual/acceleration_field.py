@@ -7,35 +7,35 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from rafl.residual.features import FEATURES, GaussPoints, features, mirrored_features
-from rafl.residual.field_force import FieldForce, FieldPoints
+from rafl.residual.features import FEATURES, GaussPoints, features, mirror_signs
+from rafl.residual.field_force import FieldPoints, field_force
 from rafl.simulation.rollout import ResidualForce
 from rafl.simulation.simulator import Simulator
 
-KINDS = (slice(0, 13), slice(13, 31), slice(31, 34))  # strains, rates, accelerations by external forces
-SMALLEST = 1e-3  # size of a feature that counts, of its kind's
-NOTHING = 1e-6  # [1, 1/s, m/s^2]; a kind below it was not seen
+FEATURE_GROUPS = (slice(0, 13), slice(13, 31), slice(31, 34))  # strains, rates, accelerations by external forces
+MIN_RELATIVE_SIZE = 1e-3  # smallest feature size used for scaling, relative to the RMS of its group
+MIN_GROUP_SIZE = 1e-6  # [1, 1/s, m/s^2]; a group with a smaller RMS is not scaled
 
-MIRROR = 1.0 - 2.0 * torch.eye(3, dtype=torch.float64)  # signs of a vector's components, a row for each axis
+MIRROR_SIGNS = 1.0 - 2.0 * torch.eye(3, dtype=torch.float64)  # signs of vector components, one row per mirror axis
 
 
 class ResidualField(nn.Module):
     """MLP without biases from 34 features to an acceleration in the co-rotated frame [m/s^2].
 
-    Zero features give zero acceleration, and the answer turns with the body. `scale` multiplies the
-    features before the first layer; it changes how fast training goes, not what can be expressed.
+    Zero features give zero acceleration, and the output rotates with the body. `scale` multiplies the features before
+    the first layer. It changes the speed of training, not what the network can express.
 
-    Where `mirrors` (3) is true for an axis, the mirror image across that axis gives the mirror image of the
-    acceleration, as it must in any isotropic material: a field that only learned it from a beam's motion turns a
-    thinner body's swing into a growing twist. In such a mirror every hidden unit changes places with another; weights
-    act by their mean with their own mirror images, which costs no time.
+    `mirrors` (3) holds, for each axis, whether a mirrored motion gives the mirrored acceleration, as in any isotropic
+    material. A field that only learns this symmetry from the motion of a beam turns the swing of a thinner body into a
+    growing twist. The symmetry is exact: a mirror permutes the hidden units in pairs, and each weight matrix is
+    averaged with its mirror image, at no extra cost per evaluation.
 
     Args:
         width: units of each hidden layer, a multiple of 8.
-        layers: how many of them.
+        layers: number of hidden layers.
 
     Raises:
-        ValueError: another width, whose units cannot change places in every mirror.
+        ValueError: the width is no multiple of 8, so the units cannot be paired in all three mirrors.
     """
 
     scale: Tensor
@@ -54,51 +54,52 @@ class ResidualField(nn.Module):
         self.register_buffer("scale", torch.ones(FEATURES, dtype=torch.float64))
         self.register_buffer("mirrors", torch.zeros(3, dtype=torch.bool))
 
-    def mirror(self, across: Tensor) -> None:
-        """Give a new field the symmetry of what it will be trained on: `mirrors` becomes `across`, (3).
+    def impose_symmetry(self, planes: Tensor) -> None:
+        """Set `mirrors` of a new field to `planes` (3), the symmetry planes of all specimens that it is trained on.
 
-        Means of two random weights are smaller than each; the weights grow by as much, so that training starts alike.
+        The mean of two random weights is smaller than each of them. The weights are scaled up to compensate, so that
+        training starts with outputs of the same size.
         """
-        self.mirrors.copy_(across)
+        self.mirrors.copy_(planes)
         with torch.no_grad():
             for weight in self.parameters():
-                weight.mul_(2.0 ** (0.5 * float(across.sum())))
+                weight.mul_(2.0 ** (0.5 * float(planes.sum())))
 
     def forward(self, inputs: Tensor) -> Tensor:
-        """Co-rotated accelerations (..., 3) of features (..., 34)."""
+        """Co-rotated accelerations (..., 3) from features (..., 34)."""
         *hidden, last = self.weights()
         for matrix in hidden:
             inputs = nn.functional.elu(inputs @ matrix.T)
         return inputs @ last.T
 
     def weights(self, precision: torch.dtype = torch.float64) -> list[Tensor]:
-        """The matrices that act, the features' scale in the first; gradients flow back to the parameters."""
+        """Effective weight matrices: mirrored, with the feature scale in the first; differentiable."""
         first, *middle, last = (layer.weight for layer in self.network if isinstance(layer, nn.Linear))
         first = first * self.scale
         for axis in self.mirrors.nonzero()[:, 0].tolist():
-            sign = MIRROR[axis]
+            sign = MIRROR_SIGNS[axis]
             swap = torch.arange(len(first)) ^ (1 << axis)
-            first = 0.5 * (first + first[swap] * mirrored_features(sign))
+            first = 0.5 * (first + first[swap] * mirror_signs(sign))
             middle = [0.5 * (matrix + matrix[swap][:, swap]) for matrix in middle]
             last = 0.5 * (last + sign[:, None] * last[:, swap])
         return [matrix.to(precision) for matrix in (first, *middle, last)]
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Become the field whose `state_dict` this is; one that was saved without mirrors has none."""
+        """Load a `state_dict`; one saved by an earlier version, without `mirrors`, has no mirror symmetry."""
         self.load_state_dict({"mirrors": torch.zeros_like(self.mirrors), **state})
 
     def on(self, simulator: Simulator, precision: torch.dtype = torch.float64) -> ResidualForce:
-        """This field on a specimen: (q, v, external force) -> nodal forces [N], all (B, N, 3).
+        """The force of this field on a specimen: (q, v, external force) -> nodal forces [N], all (B, N, 3).
 
-        `precision` is the network's; training does with `torch.float32`, in three fifths of the time.
+        `precision` is that of the network. Training uses `torch.float32`, which takes three fifths of the time.
         """
         if simulator.arithmetic == "plain":
-            return self.plainly_on(simulator)
+            return self.reference_on(simulator)
         points, weights = FieldPoints.of(simulator), self.weights(precision)
-        return lambda q, v, external: FieldForce.apply(q, v, points, *weights)
+        return lambda q, v, external: field_force(q, v, points, *weights)
 
-    def plainly_on(self, simulator: Simulator) -> ResidualForce:
-        """The same in tensors, which is the specification."""
+    def reference_on(self, simulator: Simulator) -> ResidualForce:
+        """Reference implementation of `on` in plain tensors."""
         points = GaussPoints.of(simulator.mesh, simulator.material.density)
         gravity = torch.tensor(simulator.gravity, dtype=torch.float64)
 
@@ -109,15 +110,15 @@ class ResidualField(nn.Module):
 
         return force
 
-    def scale_to(self, size: Tensor) -> None:
-        """Set `scale` from each feature's root mean square over some states, (34).
+    def set_scale(self, size: Tensor) -> None:
+        """Set `scale` from the root mean square of each feature over training states, `size` (34).
 
-        A feature is divided by the geometric mean of its own size and of its kind's. By its own alone, components that
-        the recordings hardly excite, as shear across a beam that bends in its plane, become the loudest on other
-        shapes; by its kind's alone, beams of another thickness come out worse.
+        Each feature is divided by the geometric mean of its own size and the RMS of its group. With its own size alone,
+        features that the recordings hardly excite, such as shear across a beam that bends in its plane, dominate on
+        other shapes. With the RMS of the group alone, errors on beams of another thickness are larger.
         """
         self.scale.fill_(1.0)
-        for kind in KINDS:
-            together = size[kind].square().mean().sqrt()
-            if together > NOTHING:
-                self.scale[kind] = (size[kind].clamp_min(SMALLEST * together) * together).rsqrt()
+        for group in FEATURE_GROUPS:
+            group_size = size[group].square().mean().sqrt()
+            if group_size > MIN_GROUP_SIZE:
+                self.scale[group] = (size[group].clamp_min(MIN_RELATIVE_SIZE * group_size) * group_size).rsqrt()

@@ -1,33 +1,38 @@
 """The 34 local features of the residual acceleration field (paper, table of input features)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from numba import njit, prange
+from numpy.typing import NDArray
 from torch import Tensor
 
 from rafl.fem.mesh import HexMesh
 from rafl.fem.svd import signed_svd
 
+Array = NDArray[Any]
+
 FEATURES = 34
 
 
 @njit(cache=True, parallel=True)
-def _batched_svd(F, U, s, V):
+def _batched_svd(F: Array, U: Array, s: Array, V: Array) -> None:
     for index in prange(F.shape[0]):
         signed_svd(F[index], U[index], s[index], V[index])
 
 
-class _PolarStretch(torch.autograd.Function):
+class _PolarDecomposition(torch.autograd.Function):
     """Rotation R (P, 3, 3) and ascending signed stretches (P, 3) of F (P, 3, 3).
 
-    The backward never divides by a difference of stretches, so repeated ones (and exact rest) are
-    harmless: dR = U [(M - M^T)_ij / (s_i + s_j)] V^T and ds_i = M_ii with M = U^T dF V.
+    The derivatives dR = U [(M - M^T)_ij / (s_i + s_j)] V^T and ds_i = M_ii, with M = U^T dF V, contain no difference of
+    stretches. So they are finite at repeated stretches and at exact rest.
     """
 
     @staticmethod
-    def forward(ctx, F: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, F: Tensor) -> tuple[Tensor, Tensor]:
         array = F.detach().numpy()
         U, V = np.empty_like(array), np.empty_like(array)
         s = np.empty(array.shape[:-1])
@@ -37,23 +42,27 @@ class _PolarStretch(torch.autograd.Function):
         return left @ right.mT, stretch.flip(-1)
 
     @staticmethod
-    def backward(ctx, by_R: Tensor, by_s: Tensor) -> Tensor:
+    def backward(ctx: Any, by_R: Tensor, by_s: Tensor) -> Tensor:
         U, s, V = ctx.saved_tensors
         N = U.mT @ by_R @ V
         total = s[:, :, None] + s[:, None, :]
         total = torch.where(total.abs() < 1e-9, torch.full_like(total, 1e-9), total)
         K = (N - N.mT) / total + torch.diag_embed(by_s.flip(-1))
-        return U @ K @ V.mT
+        by_F: Tensor = U @ K @ V.mT
+        return by_F
+
+
+polar_decomposition: Callable[[Tensor], tuple[Tensor, Tensor]] = _PolarDecomposition.apply
 
 
 @dataclass(frozen=True)
 class GaussPoints:
-    """What features and forces need of a mesh, as tensors.
+    """Mesh data for features and forces, as tensors.
 
     Attributes:
         hexes: (E, 8).
-        shape: (8 points, 8 nodes).
-        gradient: [1/m], (E, 8 points, 8 nodes, 3).
+        shape: shape functions, (8 points, 8 nodes).
+        gradient: shape function gradients [1/m], (E, 8 points, 8 nodes, 3).
         mass: true mass of each point, rho V_e [kg], (E, 8).
     """
 
@@ -64,7 +73,7 @@ class GaussPoints:
 
     @classmethod
     def of(cls, mesh: HexMesh, density: float) -> "GaussPoints":
-        """The Gauss points of a mesh of density [kg/m^3]."""
+        """Gauss points of a mesh with a density [kg/m^3]."""
         rule = mesh.quadrature
         return cls(
             torch.from_numpy(mesh.hexes),
@@ -74,7 +83,7 @@ class GaussPoints:
         )
 
     def accumulate(self, acceleration: Tensor, nodes: int) -> Tensor:
-        """Nodal forces [N], (B, N, 3), of accelerations (B, E, 8, 3) [m/s^2] (paper, accumulation eq.)."""
+        """Nodal forces [N], (B, N, 3), from accelerations [m/s^2], (B, E, 8, 3) (paper, accumulation eq.)."""
         share = torch.einsum("gn,begi->beni", self.shape, acceleration * self.mass[..., None])
         force = share.new_zeros(len(share), nodes, 3)
         return force.index_add(1, self.hexes.reshape(-1), share.reshape(len(share), -1, 3))
@@ -85,19 +94,19 @@ def features(q: Tensor, v: Tensor, points: GaussPoints, gravity: Tensor) -> tupl
 
     Args:
         q, v: positions [m] and velocities [m/s], (B, N, 3).
-        points: of the mesh.
+        points: Gauss points of the mesh.
         gravity: acceleration by external body forces [m/s^2], (3).
 
     Returns:
         Features (B, E, 8, 34), in order: principal stretches - 1 (ascending), flat(F^T F - I),
         det F - 1, diag D, tr D, flat(dev D), sqrt(|dev D|^2 / 2), axial W, |2 axial W|, R^T g, where
-        D and W are co-rotated; and R (B, E, 8, 3, 3).
+        D and W are the co-rotated symmetric and skew velocity gradients; and rotations R (B, E, 8, 3, 3).
     """
     batch, cells = len(q), len(points.hexes)
     at_nodes = torch.stack([q, v])[:, :, points.hexes]  # (2, B, E, 8, 3)
     F, rate = torch.einsum("sbeni,egnj->sbegij", at_nodes, points.gradient).reshape(2, -1, 3, 3)
-    R, stretch = _PolarStretch.apply(F)
-    local = R.mT @ F  # right stretch tensor S; L co-rotated is R^T rate F^-1 R = R^T rate S^-1
+    R, stretch = polar_decomposition(F)
+    local = R.mT @ F  # right stretch tensor S; co-rotated L = R^T (rate F^-1) R = R^T rate S^-1
     a, b, c = local.unbind(-1)
     cofactor = torch.stack([torch.linalg.cross(b, c), torch.linalg.cross(c, a), torch.linalg.cross(a, b)], dim=-2)
     determinant = (a * cofactor[:, 0]).sum(-1, keepdim=True)
@@ -109,7 +118,7 @@ def features(q: Tensor, v: Tensor, points: GaussPoints, gravity: Tensor) -> tupl
     trace = diagonal.sum(-1, keepdim=True)
     shear = D - trace[..., None] / 3.0 * identity
     axial = torch.stack([W[:, 2, 1], W[:, 0, 2], W[:, 1, 0]], dim=-1)
-    # A square root has no slope at zero: 1e-20 (1/s)^2 keeps both finite at exact rest.
+    # The derivative of a square root is infinite at zero. Small constants keep both derivatives finite at exact rest.
     shear_size = torch.sqrt(0.5 * (shear**2).sum((-2, -1)) + 1e-20)[:, None]
     spin_size = torch.sqrt(4.0 * (axial**2).sum(-1) + 1e-30)[:, None]
     parts = [
@@ -128,8 +137,8 @@ def features(q: Tensor, v: Tensor, points: GaussPoints, gravity: Tensor) -> tupl
     return torch.cat(parts, dim=-1).reshape(*shape, FEATURES), R.reshape(*shape, 3, 3)
 
 
-def mirrored_features(sign: Tensor) -> Tensor:
-    """The signs, (34), that the features take in a mirror where a vector's components take the signs `sign` (3)."""
+def mirror_signs(sign: Tensor) -> Tensor:
+    """Signs (34) of the features under a reflection that gives the vector components the signs `sign` (3)."""
     one, even = sign.new_ones(1), sign.new_ones(3)
     tensor = torch.outer(sign, sign).flatten()
     axial = sign.prod() * sign

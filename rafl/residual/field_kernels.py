@@ -1,38 +1,40 @@
-"""The residual field's features, their derivatives and its nodal forces, compiled.
+"""Compiled kernels for the features of the residual field, their derivatives and the nodal forces.
 
-`rafl.residual.features` says the same in tensors and is what these kernels are tested against. One lane of a row is a Gauss
-point of a cell; numbers for the network stand feature by feature, (34, points), and points cell by cell.
+They are tested against the tensors of `rafl.residual.features`. A row has eight SIMD lanes, one per Gauss point of a
+cell. Arrays for the network have one row per feature, (34, points), with the points in order of the cells.
+`by_x` is the derivative of a scalar with respect to x.
 """
 
 import numpy as np
 from numba import njit, prange
 
 from rafl.fem.kernel_layout import DEFORMATION, STRETCH, U, V
-from rafl.fem.simd import KERNEL, lane_products, weighted_rows
-from rafl.fem.svd import signed_svd_lanes
+from rafl.fem.simd import KERNEL_OPTIONS, lane_products, weighted_rows
+from rafl.fem.svd import signed_svd_simd
 
-CHUNK = 16  # cells a thread takes at a time
-KEPT = 48  # rows of a cell that the derivatives need again
+CELLS_PER_CHUNK = 16  # cells a thread takes at a time
+SAVED_ROWS = 48  # rows per cell that the forward kernel saves for the derivatives
 
-# Rows of the scratch besides those of the decomposition (0 to 63), nine to a matrix.
-RATE = 64  # sum over nodes of v (x) gradient
-TURN = 73  # R = U V^T
-STRETCHED = 82  # R^T F
-INVERSE = 91  # of that
-LOCAL = 100  # R^T RATE INVERSE, the co-rotated velocity gradient
-MIDDLE = 109
-BY_LOCAL = 118  # derivatives by these, from here on
-BY_TURN = 127
+# Rows of the scratch array after those of the decomposition (0 to 63); nine rows per matrix unless noted.
+RATE = 64  # dF/dt: sum over nodes of v (x) gradient
+ROTATION = 73  # R = U V^T
+STRETCH_TENSOR = 82  # right stretch tensor S = R^T F
+INVERSE = 91  # S^-1
+LOCAL = 100  # co-rotated velocity gradient R^T dF/dt S^-1
+ROTATED_RATE = 109  # R^T dF/dt
+BY_LOCAL = 118  # from here on: derivatives with respect to the quantities above
+BY_ROTATION = 127
 BY_DEFORMATION = 136
 BY_RATE = 145
-BY_STRETCHED = 154
-SPIN = 163
+BY_STRETCH_TENSOR = 154
+TEMPORARY = 163
+TEMPORARY_2 = ROTATED_RATE  # reused when the rotated rate is no longer needed
 BY_STRETCH = 172  # 3
-DETERMINANT = 175
+DETERMINANT = 175  # 1
 ROWS = 176
 
-# Where in `kept` each point's quantities stand.
-KEPT_RATE, KEPT_U, KEPT_V, KEPT_TURN, KEPT_STRETCH = 9, 18, 27, 36, 45
+# First rows of the quantities in `saved`; F starts at row 0.
+SAVED_RATE, SAVED_U, SAVED_V, SAVED_ROTATION, SAVED_STRETCH = 9, 18, 27, 36, 45
 
 _gather = weighted_rows(8, 3, 24)  # sum over nodes of position times gradient
 _row_by_column = lane_products(3, 8, 24)  # (A B)_ij
@@ -40,44 +42,44 @@ _column_by_column = lane_products(3, 24, 24)  # (A^T B)_ij
 _row_by_row = lane_products(3, 8, 8)  # (A B^T)_ij
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def _product(w, out, a, b):
     for i in range(3):
         for j in range(3):
             _row_by_column(w, (out + 3 * i + j) * 8, w, (a + 3 * i) * 8, w, (b + j) * 8)
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def _transposed_product(w, out, a, b):
     for i in range(3):
         for j in range(3):
             _column_by_column(w, (out + 3 * i + j) * 8, w, (a + i) * 8, w, (b + j) * 8)
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def _product_transposed(w, out, a, b):
     for i in range(3):
         for j in range(3):
             _row_by_row(w, (out + 3 * i + j) * 8, w, (a + 3 * i) * 8, w, (b + 3 * j) * 8)
 
 
-@njit(**KERNEL)
-def _invert(w):
-    """The right stretch tensor's inverse and its determinant."""
+@njit(**KERNEL_OPTIONS)
+def _invert_stretch_tensor(w):
+    """Inverse and determinant of the right stretch tensor."""
     for i in range(3):
         for j in range(3):
             k, m = (j + 1) % 3, (j + 2) % 3
             p, r = (i + 1) % 3, (i + 2) % 3
-            for g in range(8):  # the cofactor of (j, i)
+            for g in range(8):  # cofactor (j, i)
                 w[(INVERSE + 3 * i + j) * 8 + g] = (
-                    w[(STRETCHED + 3 * k + p) * 8 + g] * w[(STRETCHED + 3 * m + r) * 8 + g]
-                    - w[(STRETCHED + 3 * k + r) * 8 + g] * w[(STRETCHED + 3 * m + p) * 8 + g]
+                    w[(STRETCH_TENSOR + 3 * k + p) * 8 + g] * w[(STRETCH_TENSOR + 3 * m + r) * 8 + g]
+                    - w[(STRETCH_TENSOR + 3 * k + r) * 8 + g] * w[(STRETCH_TENSOR + 3 * m + p) * 8 + g]
                 )
     for g in range(8):
         determinant = (
-            w[STRETCHED * 8 + g] * w[INVERSE * 8 + g]
-            + w[(STRETCHED + 1) * 8 + g] * w[(INVERSE + 3) * 8 + g]
-            + w[(STRETCHED + 2) * 8 + g] * w[(INVERSE + 6) * 8 + g]
+            w[STRETCH_TENSOR * 8 + g] * w[INVERSE * 8 + g]
+            + w[(STRETCH_TENSOR + 1) * 8 + g] * w[(INVERSE + 3) * 8 + g]
+            + w[(STRETCH_TENSOR + 2) * 8 + g] * w[(INVERSE + 6) * 8 + g]
         )
         w[DETERMINANT * 8 + g] = determinant
     for i in range(9):
@@ -85,61 +87,62 @@ def _invert(w):
             w[(INVERSE + i) * 8 + g] /= w[DETERMINANT * 8 + g]
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def _local_motion(w):
-    """From F and RATE: rotation, right stretch tensor and its inverse, co-rotated velocity gradient."""
-    signed_svd_lanes(w)
-    _product_transposed(w, TURN, U, V)
-    _transposed_product(w, STRETCHED, TURN, DEFORMATION)
-    _invert(w)
-    _transposed_product(w, MIDDLE, TURN, RATE)
-    _product(w, LOCAL, MIDDLE, INVERSE)
+    """Rotation, right stretch tensor, its inverse and the co-rotated velocity gradient, from F and dF/dt."""
+    signed_svd_simd(w)
+    _product_transposed(w, ROTATION, U, V)
+    _transposed_product(w, STRETCH_TENSOR, ROTATION, DEFORMATION)
+    _invert_stretch_tensor(w)
+    _transposed_product(w, ROTATED_RATE, ROTATION, RATE)
+    _product(w, LOCAL, ROTATED_RATE, INVERSE)
 
 
-@njit(parallel=True, **KERNEL)
-def local_features(q, v, hexes, slopes, gravity, kept, inputs):
-    """Fill inputs (34, B E 8) and what the derivatives need again, kept (B, E, KEPT, 8).
+@njit(parallel=True, **KERNEL_OPTIONS)
+def local_features(q, v, hexes, gradients, gravity, saved, inputs):
+    """Fill the features `inputs` (34, B E 8), and `saved` (B, E, SAVED_ROWS, 8) for the derivatives.
 
     Args:
         q, v: positions [m] and velocities [m/s], (B, N, 3).
         hexes: (E, 8).
-        slopes: shape function gradients [1/m], (E, 8 nodes * 3 * 8 points).
+        gradients: shape function gradients [1/m], (E, 8 nodes * 3 * 8 points).
         gravity: [m/s^2], (3).
-        kept, inputs: outputs.
+        saved, inputs: outputs.
     """
     cells = len(hexes)
-    chunks = (cells + CHUNK - 1) // CHUNK
+    chunks = (cells + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK
     for task in prange(len(q) * chunks):
         b = task // chunks
         w = np.empty(ROWS * 8)
         x = np.empty(48)
-        for e in range((task % chunks) * CHUNK, min(cells, (task % chunks + 1) * CHUNK)):
+        for e in range((task % chunks) * CELLS_PER_CHUNK, min(cells, (task % chunks + 1) * CELLS_PER_CHUNK)):
             for n in range(8):
                 for i in range(3):
                     x[3 * n + i] = q[b, hexes[e, n], i]
                     x[24 + 3 * n + i] = v[b, hexes[e, n], i]
-            own = slopes[e]
+            own = gradients[e]
             for i in range(3):
                 for j in range(3):
                     _gather(w, (DEFORMATION + 3 * i + j) * 8, x, i, own, j * 8)
                     _gather(w, (RATE + 3 * i + j) * 8, x, 24 + i, own, j * 8)
             _local_motion(w)
             _write_features(w, gravity, inputs, (b * cells + e) * 8)
-            out = kept[b, e]
+            out = saved[b, e]
             for r in range(9):
                 for g in range(8):
                     out[r, g] = w[(DEFORMATION + r) * 8 + g]
-                    out[KEPT_RATE + r, g] = w[(RATE + r) * 8 + g]
-                    out[KEPT_U + r, g] = w[(U + r) * 8 + g]
-                    out[KEPT_V + r, g] = w[(V + r) * 8 + g]
-                    out[KEPT_TURN + r, g] = w[(TURN + r) * 8 + g]
+                    out[SAVED_RATE + r, g] = w[(RATE + r) * 8 + g]
+                    out[SAVED_U + r, g] = w[(U + r) * 8 + g]
+                    out[SAVED_V + r, g] = w[(V + r) * 8 + g]
+                    out[SAVED_ROTATION + r, g] = w[(ROTATION + r) * 8 + g]
             for r in range(3):
                 for g in range(8):
-                    out[KEPT_STRETCH + r, g] = w[(STRETCH + r) * 8 + g]
+                    out[SAVED_STRETCH + r, g] = w[(STRETCH + r) * 8 + g]
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def _write_features(w, gravity, inputs, first):
+    """Fill the features of the eight points from column `first` on, in the order of `rafl.residual.features`."""
     for g in range(8):
         p = first + g
         a, b, c = w[STRETCH * 8 + g], w[(STRETCH + 1) * 8 + g], w[(STRETCH + 2) * 8 + g]
@@ -179,28 +182,33 @@ def _write_features(w, gravity, inputs, first):
         inputs[30, p] = np.sqrt(4.0 * (x * x + y * y + z * z) + 1e-30)
         for i in range(3):
             inputs[31 + i, p] = (
-                w[(TURN + i) * 8 + g] * gravity[0]
-                + w[(TURN + 3 + i) * 8 + g] * gravity[1]
-                + w[(TURN + 6 + i) * 8 + g] * gravity[2]
+                w[(ROTATION + i) * 8 + g] * gravity[0]
+                + w[(ROTATION + 3 + i) * 8 + g] * gravity[1]
+                + w[(ROTATION + 6 + i) * 8 + g] * gravity[2]
             )
 
 
-@njit(parallel=True, **KERNEL)
-def nodal_forces(acceleration, kept, mass, shape, hexes, force):
-    """Fill force (B, N, 3): sum over points of shape function times mass times R times acceleration (3, B E 8)."""
+@njit(parallel=True, **KERNEL_OPTIONS)
+def nodal_forces(acceleration, saved, mass, shape, hexes, force):
+    """Fill nodal forces `force` (B, N, 3) [N] from co-rotated accelerations (3, B E 8) [m/s^2].
+
+    The force is the sum over points of shape function * mass * R acceleration.
+    """
     cells = len(hexes)
     part = np.empty((len(force), cells, 8, 3))
     for c in prange(len(force) * cells):
         b, e = c // cells, c % cells
-        turn = kept[b, e, KEPT_TURN:]
+        rotation = saved[b, e, SAVED_ROTATION:]
         own = part[b, e]
         own[:] = 0.0
         for g in range(8):
             a0, a1, a2 = (acceleration[0, c * 8 + g], acceleration[1, c * 8 + g], acceleration[2, c * 8 + g])
             for i in range(3):
-                pull = mass[e, g] * (turn[3 * i, g] * a0 + turn[3 * i + 1, g] * a1 + turn[3 * i + 2, g] * a2)
+                point_force = mass[e, g] * (
+                    rotation[3 * i, g] * a0 + rotation[3 * i + 1, g] * a1 + rotation[3 * i + 2, g] * a2
+                )
                 for n in range(8):
-                    own[n, i] += shape[g, n] * pull
+                    own[n, i] += shape[g, n] * point_force
     for b in prange(len(force)):
         force[b] = 0.0
         for e in range(cells):
@@ -209,13 +217,14 @@ def nodal_forces(acceleration, kept, mass, shape, hexes, force):
                     force[b, hexes[e, n], i] += part[b, e, n, i]
 
 
-@njit(parallel=True, **KERNEL)
-def by_acceleration(by_force, kept, mass, shape, hexes, out):
-    """Fill out (6, B E 8): derivatives by the pull on each point in the world's frame, then by its acceleration."""
+@njit(parallel=True, **KERNEL_OPTIONS)
+def acceleration_adjoint(by_force, saved, mass, shape, hexes, out):
+    """Fill `out` (6, B E 8): derivatives with respect to each point's acceleration, in the world frame (3
+    rows), then in the co-rotated frame (3 rows)."""
     cells = len(hexes)
     for c in prange(len(by_force) * cells):
         b, e = c // cells, c % cells
-        turn = kept[b, e, KEPT_TURN:]
+        rotation = saved[b, e, SAVED_ROTATION:]
         for g in range(8):
             p = c * 8 + g
             for i in range(3):
@@ -224,38 +233,40 @@ def by_acceleration(by_force, kept, mass, shape, hexes, out):
                     total += shape[g, n] * by_force[b, hexes[e, n], i]
                 out[i, p] = mass[e, g] * total
             for i in range(3):
-                out[3 + i, p] = turn[i, g] * out[0, p] + turn[3 + i, g] * out[1, p] + turn[6 + i, g] * out[2, p]
+                out[3 + i, p] = (
+                    rotation[i, g] * out[0, p] + rotation[3 + i, g] * out[1, p] + rotation[6 + i, g] * out[2, p]
+                )
 
 
-@njit(parallel=True, **KERNEL)
-def by_state(by_inputs, by_pull, acceleration, kept, hexes, slopes, gravity, by_q, by_v):
-    """Fill derivatives by positions and velocities, both (B, N, 3).
+@njit(parallel=True, **KERNEL_OPTIONS)
+def state_adjoint(by_inputs, by_world_acceleration, acceleration, saved, hexes, gradients, gravity, by_q, by_v):
+    """Fill derivatives with respect to positions and velocities, both (B, N, 3).
 
     Args:
-        by_inputs: derivatives by the features, (34, B E 8).
-        by_pull: first three rows of `by_acceleration`.
-        acceleration: co-rotated, (3, B E 8).
-        kept, hexes, slopes, gravity: as of `local_features`.
+        by_inputs: derivatives with respect to the features, (34, B E 8).
+        by_world_acceleration: first three rows of the output of `acceleration_adjoint`.
+        acceleration: co-rotated accelerations [m/s^2], (3, B E 8).
+        saved, hexes, gradients, gravity: as of `local_features`.
         by_q, by_v: outputs.
     """
     cells = len(hexes)
-    chunks = (cells + CHUNK - 1) // CHUNK
+    chunks = (cells + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK
     part = np.empty((len(by_q), cells, 8, 6))
     for task in prange(len(by_q) * chunks):
         b = task // chunks
         w = np.empty(ROWS * 8)
-        for e in range((task % chunks) * CHUNK, min(cells, (task % chunks + 1) * CHUNK)):
-            stored = kept[b, e]
+        for e in range((task % chunks) * CELLS_PER_CHUNK, min(cells, (task % chunks + 1) * CELLS_PER_CHUNK)):
+            cell = saved[b, e]
             for r in range(9):
                 for g in range(8):
-                    w[(DEFORMATION + r) * 8 + g] = stored[r, g]
-                    w[(RATE + r) * 8 + g] = stored[KEPT_RATE + r, g]
-                    w[(U + r) * 8 + g] = stored[KEPT_U + r, g]
-                    w[(V + r) * 8 + g] = stored[KEPT_V + r, g]
+                    w[(DEFORMATION + r) * 8 + g] = cell[r, g]
+                    w[(RATE + r) * 8 + g] = cell[SAVED_RATE + r, g]
+                    w[(U + r) * 8 + g] = cell[SAVED_U + r, g]
+                    w[(V + r) * 8 + g] = cell[SAVED_V + r, g]
             for r in range(3):
                 for g in range(8):
-                    w[(STRETCH + r) * 8 + g] = stored[KEPT_STRETCH + r, g]
-            _by_motion(w, by_inputs, by_pull, acceleration, gravity, (b * cells + e) * 8)
+                    w[(STRETCH + r) * 8 + g] = cell[SAVED_STRETCH + r, g]
+            _by_deformation_and_rate(w, by_inputs, by_world_acceleration, acceleration, gravity, (b * cells + e) * 8)
             own = part[b, e]
             for n in range(8):
                 for i in range(3):
@@ -263,7 +274,7 @@ def by_state(by_inputs, by_pull, acceleration, kept, hexes, slopes, gravity, by_
                     y = 0.0
                     for j in range(3):
                         for g in range(8):
-                            slope = slopes[e, (3 * n + j) * 8 + g]
+                            slope = gradients[e, (3 * n + j) * 8 + g]
                             x += w[(BY_DEFORMATION + 3 * i + j) * 8 + g] * slope
                             y += w[(BY_RATE + 3 * i + j) * 8 + g] * slope
                     own[n, i] = x
@@ -278,57 +289,57 @@ def by_state(by_inputs, by_pull, acceleration, kept, hexes, slopes, gravity, by_
                     by_v[b, hexes[e, n], i] += part[b, e, n, 3 + i]
 
 
-@njit(**KERNEL)
-def _by_motion(w, by_inputs, by_pull, acceleration, gravity, first):
-    """Derivatives by F and by the velocity gradient's numerator, of one cell."""
-    _product_transposed(w, TURN, U, V)
-    _transposed_product(w, STRETCHED, TURN, DEFORMATION)
-    _invert(w)
-    _transposed_product(w, MIDDLE, TURN, RATE)
-    _product(w, LOCAL, MIDDLE, INVERSE)
+@njit(**KERNEL_OPTIONS)
+def _by_deformation_and_rate(w, by_inputs, by_world_acceleration, acceleration, gravity, first):
+    """Derivatives with respect to F and dF/dt of one cell."""
+    _product_transposed(w, ROTATION, U, V)
+    _transposed_product(w, STRETCH_TENSOR, ROTATION, DEFORMATION)
+    _invert_stretch_tensor(w)
+    _transposed_product(w, ROTATED_RATE, ROTATION, RATE)
+    _product(w, LOCAL, ROTATED_RATE, INVERSE)
     _by_local(w, by_inputs, first)
     for i in range(3):
         for j in range(3):
             for g in range(8):
                 p = first + g
-                w[(BY_TURN + 3 * i + j) * 8 + g] = (
-                    gravity[i] * by_inputs[31 + j, p] + by_pull[i, p] * acceleration[j, p]
+                w[(BY_ROTATION + 3 * i + j) * 8 + g] = (
+                    gravity[i] * by_inputs[31 + j, p] + by_world_acceleration[i, p] * acceleration[j, p]
                 )
-                # of F^T F - 1, and of det F - 1: cofactor = det R S^-T
+                # through det F - 1, with d det F / dF = det F R S^-T; and through F^T F - I
                 w[(BY_DEFORMATION + 3 * i + j) * 8 + g] = w[DETERMINANT * 8 + g] * by_inputs[12, p] * (
-                    w[(TURN + 3 * i) * 8 + g] * w[(INVERSE + 3 * j) * 8 + g]
-                    + w[(TURN + 3 * i + 1) * 8 + g] * w[(INVERSE + 3 * j + 1) * 8 + g]
-                    + w[(TURN + 3 * i + 2) * 8 + g] * w[(INVERSE + 3 * j + 2) * 8 + g]
+                    w[(ROTATION + 3 * i) * 8 + g] * w[(INVERSE + 3 * j) * 8 + g]
+                    + w[(ROTATION + 3 * i + 1) * 8 + g] * w[(INVERSE + 3 * j + 1) * 8 + g]
+                    + w[(ROTATION + 3 * i + 2) * 8 + g] * w[(INVERSE + 3 * j + 2) * 8 + g]
                 ) + (
                     w[(DEFORMATION + 3 * i) * 8 + g] * (by_inputs[3 + j, p] + by_inputs[3 + 3 * j, p])
                     + w[(DEFORMATION + 3 * i + 1) * 8 + g] * (by_inputs[6 + j, p] + by_inputs[3 + 3 * j + 1, p])
                     + w[(DEFORMATION + 3 * i + 2) * 8 + g] * (by_inputs[9 + j, p] + by_inputs[3 + 3 * j + 2, p])
                 )
-    # LOCAL = R^T RATE S^-1
-    _product_transposed(w, SPIN, BY_LOCAL, INVERSE)  # by R^T RATE
-    _product(w, BY_RATE, TURN, SPIN)
-    _product_transposed(w, BY_STRETCHED, RATE, SPIN)
-    _accumulate(w, BY_TURN, BY_STRETCHED, 1.0)
-    _transposed_product(w, SPIN, MIDDLE, BY_LOCAL)  # by S^-1
-    _product_transposed(w, BY_STRETCHED, SPIN, INVERSE)
-    _transposed_product(w, SPIN, INVERSE, BY_STRETCHED)  # by S, sign to come
-    _product(w, BY_STRETCHED, TURN, SPIN)
-    _accumulate(w, BY_DEFORMATION, BY_STRETCHED, -1.0)
-    _product_transposed(w, BY_STRETCHED, DEFORMATION, SPIN)
-    _accumulate(w, BY_TURN, BY_STRETCHED, -1.0)
-    _by_decomposition(w, by_inputs, first)
+    # LOCAL = R^T RATE S^-1, differentiated factor by factor
+    _product_transposed(w, TEMPORARY, BY_LOCAL, INVERSE)  # with respect to R^T RATE
+    _product(w, BY_RATE, ROTATION, TEMPORARY)
+    _product_transposed(w, BY_STRETCH_TENSOR, RATE, TEMPORARY)
+    _accumulate(w, BY_ROTATION, BY_STRETCH_TENSOR, 1.0)
+    _transposed_product(w, TEMPORARY, ROTATED_RATE, BY_LOCAL)  # with respect to S^-1
+    _product_transposed(w, BY_STRETCH_TENSOR, TEMPORARY, INVERSE)
+    _transposed_product(w, TEMPORARY, INVERSE, BY_STRETCH_TENSOR)  # with respect to S, up to the sign
+    _product(w, BY_STRETCH_TENSOR, ROTATION, TEMPORARY)
+    _accumulate(w, BY_DEFORMATION, BY_STRETCH_TENSOR, -1.0)
+    _product_transposed(w, BY_STRETCH_TENSOR, DEFORMATION, TEMPORARY)
+    _accumulate(w, BY_ROTATION, BY_STRETCH_TENSOR, -1.0)
+    _add_by_decomposition(w, by_inputs, first)
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def _accumulate(w, out, a, sign):
     for r in range(9):
         for g in range(8):
             w[(out + r) * 8 + g] += sign * w[(a + r) * 8 + g]
 
 
-@njit(**KERNEL)
+@njit(**KERNEL_OPTIONS)
 def _by_local(w, by_inputs, first):
-    """Derivatives by the co-rotated velocity gradient."""
+    """Derivatives with respect to the co-rotated velocity gradient."""
     for g in range(8):
         p = first + g
         trace = w[LOCAL * 8 + g] + w[(LOCAL + 4) * 8 + g] + w[(LOCAL + 8) * 8 + g]
@@ -340,22 +351,24 @@ def _by_local(w, by_inputs, first):
             for j in range(3):
                 d = 0.5 * (w[(LOCAL + 3 * i + j) * 8 + g] + w[(LOCAL + 3 * j + i) * 8 + g])
                 d = d - trace / 3.0 if i == j else d
-                w[(SPIN + 3 * i + j) * 8 + g] = d
+                w[(TEMPORARY + 3 * i + j) * 8 + g] = d
                 size += d * d
         shear = 0.5 * by_inputs[26, p] / np.sqrt(0.5 * size + 1e-20)
         spin = 4.0 * by_inputs[30, p] / np.sqrt(4.0 * (x * x + y * y + z * z) + 1e-30)
         mean = 0.0
         for i in range(3):
             for j in range(3):
-                w[(SPIN + 3 * i + j) * 8 + g] = by_inputs[17 + 3 * i + j, p] + shear * w[(SPIN + 3 * i + j) * 8 + g]
-            mean += w[(SPIN + 4 * i) * 8 + g] / 3.0
+                w[(TEMPORARY + 3 * i + j) * 8 + g] = (
+                    by_inputs[17 + 3 * i + j, p] + shear * w[(TEMPORARY + 3 * i + j) * 8 + g]
+                )
+            mean += w[(TEMPORARY + 4 * i) * 8 + g] / 3.0
         for i in range(3):
-            w[(SPIN + 4 * i) * 8 + g] += by_inputs[13 + i, p] + by_inputs[16, p] - mean
+            w[(TEMPORARY + 4 * i) * 8 + g] += by_inputs[13 + i, p] + by_inputs[16, p] - mean
             for j in range(3):
                 w[(BY_LOCAL + 3 * i + j) * 8 + g] = 0.0
         for i in range(3):
             for j in range(3):
-                half = 0.5 * w[(SPIN + 3 * i + j) * 8 + g]
+                half = 0.5 * w[(TEMPORARY + 3 * i + j) * 8 + g]
                 w[(BY_LOCAL + 3 * i + j) * 8 + g] += half
                 w[(BY_LOCAL + 3 * j + i) * 8 + g] += half
         x = 0.5 * (by_inputs[27, p] + spin * x)
@@ -369,31 +382,32 @@ def _by_local(w, by_inputs, first):
         w[(BY_LOCAL + 1) * 8 + g] -= z
 
 
-@njit(**KERNEL)
-def _by_decomposition(w, by_inputs, first):
-    """Adds to the derivatives by F those through rotation and stretches; see `rafl.residual.features` for the formulae."""
+@njit(**KERNEL_OPTIONS)
+def _add_by_decomposition(w, by_inputs, first):
+    """Add to the derivatives with respect to F those through rotation and stretches, by the formulae of
+    `rafl.residual.features`."""
     for g in range(8):
         p = first + g
         for i in range(3):
-            rank = 0  # how many stretches are smaller; equal ones count by their number
+            rank = 0  # number of smaller stretches; equal stretches are ordered by index
             for j in range(3):
                 before = w[(STRETCH + j) * 8 + g] < w[(STRETCH + i) * 8 + g]
                 before = before or (w[(STRETCH + j) * 8 + g] == w[(STRETCH + i) * 8 + g] and j < i)
                 rank += before
             w[(BY_STRETCH + i) * 8 + g] = by_inputs[rank, p]
-    _transposed_product(w, MIDDLE, U, BY_TURN)
-    _product(w, SPIN, MIDDLE, V)  # U^T by_R V
+    _transposed_product(w, TEMPORARY_2, U, BY_ROTATION)
+    _product(w, TEMPORARY, TEMPORARY_2, V)  # U^T by_R V
     for i in range(3):
         for j in range(3):
             for g in range(8):
                 total = w[(STRETCH + i) * 8 + g] + w[(STRETCH + j) * 8 + g]
                 total = total if abs(total) > 1e-9 else 1e-9
-                w[(MIDDLE + 3 * i + j) * 8 + g] = (
-                    w[(SPIN + 3 * i + j) * 8 + g] - w[(SPIN + 3 * j + i) * 8 + g]
+                w[(TEMPORARY_2 + 3 * i + j) * 8 + g] = (
+                    w[(TEMPORARY + 3 * i + j) * 8 + g] - w[(TEMPORARY + 3 * j + i) * 8 + g]
                 ) / total
     for i in range(3):
         for g in range(8):
-            w[(MIDDLE + 4 * i) * 8 + g] += w[(BY_STRETCH + i) * 8 + g]
-    _product(w, SPIN, U, MIDDLE)
-    _product_transposed(w, MIDDLE, SPIN, V)
-    _accumulate(w, BY_DEFORMATION, MIDDLE, 1.0)
+            w[(TEMPORARY_2 + 4 * i) * 8 + g] += w[(BY_STRETCH + i) * 8 + g]
+    _product(w, TEMPORARY, U, TEMPORARY_2)
+    _product_transposed(w, TEMPORARY_2, TEMPORARY, V)
+    _accumulate(w, BY_DEFORMATION, TEMPORARY_2, 1.0)

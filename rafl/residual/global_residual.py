@@ -1,4 +1,4 @@
-"""The supervised baseline's network: from the whole state to a force on every vertex (paper, SRL baseline)."""
+"""Network of the supervised baseline: from the state of the whole mesh to nodal forces (paper, SRL baseline)."""
 
 import torch
 from torch import Tensor, nn
@@ -7,12 +7,12 @@ from rafl.common.errors import InputError
 from rafl.simulation.rollout import ResidualForce
 from rafl.simulation.simulator import Simulator
 
-WIDTH, BLOCKS, LAYERS = 512, 5, 3
-LEAST_SIZE = 0.05
+WIDTH, BLOCKS, LAYERS = 512, 5, 3  # units per layer, residual blocks, layers per block
+MIN_RELATIVE_DEVIATION = 0.05  # smallest standard deviation for normalisation, relative to the largest of its kind
 
 
 class _Block(nn.Module):
-    """Layers of one width whose sum is added to what came in."""
+    """Residual block: layers of one width, whose output is added to the input."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -22,20 +22,24 @@ class _Block(nn.Module):
         self.layers = nn.Sequential(*layers)
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.layers(x)
+        output: Tensor = x + self.layers(x)
+        return output
 
 
-def motion_of(q: Tensor, v: Tensor, rest: Tensor) -> Tensor:
-    """The network's input (S, 6 N), single precision, from positions and velocities (S, N, 3) and the rest (N, 3)."""
+def network_input(q: Tensor, v: Tensor, rest: Tensor) -> Tensor:
+    """Network input (S, 6 N), single precision, from positions and velocities (S, N, 3) and rest positions (N, 3)."""
     return torch.cat([(q - rest).flatten(1), v.flatten(1)], dim=1).float()
 
 
 class GlobalResidual(nn.Module):
-    """From displacements and velocities of all N vertices to a force on each; of no use on another mesh.
+    """Network from displacements and velocities of all N vertices to a force on each; bound to one mesh.
 
-    So a stretched mesh at rest is the same state as the one trained on, and the paper's errors on stretched beams come
-    out; with positions in their place they are up to six times as large. Inputs and outputs are normalised by their
-    means and standard deviations over the training states.
+    With displacements as input, a stretched mesh at rest is the same state as the training mesh at rest, and the errors
+    on stretched beams are those of the paper. With positions as input they are up to six times as large. Inputs and
+    outputs are normalised by their means and standard deviations over the training states.
+
+    Args:
+        nodes: number of vertices N.
     """
 
     motion_mean: Tensor
@@ -53,12 +57,12 @@ class GlobalResidual(nn.Module):
             start = torch.zeros if name.endswith("mean") else torch.ones
             self.register_buffer(name, start(size * nodes))
 
-    def normalise(self, motion: Tensor, forces: Tensor) -> None:
-        """Take means and standard deviations from training states (S, 6 N) and forces (S, 3 N)."""
+    def set_normalisation(self, motion: Tensor, forces: Tensor) -> None:
+        """Set means and standard deviations from training inputs (S, 6 N) and forces (S, 3 N)."""
         displacements, velocities = motion.chunk(2, dim=1)
-        # What hardly moves must not be blown up: a twentieth of the liveliest is the least size of its kind.
+        # The lower bound keeps the normalisation from amplifying components that hardly vary.
         sizes = [
-            values.std(0).clamp_min(LEAST_SIZE * float(values.std(0).max()))
+            values.std(0).clamp_min(MIN_RELATIVE_DEVIATION * float(values.std(0).max()))
             for values in (displacements, velocities, forces)
         ]
         self.motion_mean.copy_(motion.mean(0))
@@ -67,25 +71,27 @@ class GlobalResidual(nn.Module):
         self.force_size.copy_(sizes[2])
 
     def forward(self, motion: Tensor) -> Tensor:
-        """Normalised forces (S, 3 N) of states (S, 6 N)."""
-        return self.network((motion - self.motion_mean) / self.motion_size)
+        """Normalised forces (S, 3 N) from inputs (S, 6 N)."""
+        output: Tensor = self.network((motion - self.motion_mean) / self.motion_size)
+        return output
 
     def on(self, simulator: Simulator) -> ResidualForce:
-        """(q, v, external force) -> nodal forces [N], all (B, N, 3).
+        """The force of the network on a specimen: (q, v, external force) -> nodal forces [N], all (B, N, 3).
 
         Raises:
-            InputError: a mesh of another number of vertices.
+            InputError: the mesh has another number of vertices.
         """
         found = len(simulator.mesh.vertices)
         if found != self.nodes:
             raise InputError(
-                f"srl: expected the mesh it was trained on, of {self.nodes} vertices, found {found}; train it on this "
-                "mesh, or use method rafl, which works on any"
+                f"srl: expected the training mesh of {self.nodes} vertices, found {found}; train on this mesh, or use "
+                "method rafl, which works on any mesh"
             )
 
         rest = torch.from_numpy(simulator.mesh.vertices)
 
         def force(q: Tensor, v: Tensor, external: Tensor) -> Tensor:
-            return (self(motion_of(q, v, rest)) * self.force_size + self.force_mean).double().reshape(q.shape)
+            forces: Tensor = self(network_input(q, v, rest)) * self.force_size + self.force_mean
+            return forces.double().reshape(q.shape)
 
         return force

@@ -1,4 +1,4 @@
-"""The simulator's arithmetic in compiled kernels, on the processor's cores."""
+"""Engine of compiled multithreaded kernels."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,47 +9,47 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from rafl.fem.constitutive_state import Resistance
+from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.fem.elements import element_terms, multiply
 from rafl.fem.laws import LAWS
 from rafl.fem.mesh import HexMesh
-from rafl.fem.quadrature import Integration
-from rafl.solvers.choose import linear_solver
+from rafl.fem.quadrature import QuadratureRule
+from rafl.solvers.choose import choose_linear_solver
 from rafl.solvers.linear import Factors, LinearSolver
 
 Array = NDArray[Any]
 
-CELLS_FOR_TWO = 60  # in a batch, below which one thread is as fast as two
+MIN_CELLS_FOR_TWO_THREADS = 60  # in the whole batch; below it one thread is as fast as two
 
 
-class Compiled:
-    """Energy, gradient, tangent and linear solves of one mesh under one law.
+class CompiledEngine:
+    """Energy, gradient, tangent and linear solves of one mesh with one elastic law.
 
     Args:
         mesh: the rest shape.
         law: name of the elastic law.
-        integration: `full`, or `selective`: lambda's part of each cell's mean strain only (B-bar).
-        fixed: held nodes, (F).
+        integration: `full`, or `selective`: lambda at the mean strain of each cell only (B-bar).
+        fixed: indices of the fixed nodes, (F).
     """
 
     def __init__(self, mesh: HexMesh, law: str, integration: str, fixed: NDArray[np.int64]) -> None:
         self.mesh = mesh
         self.fixed = fixed
-        self._room: Factors | None = None  # of `solve_once`, which is called again and again
+        self._reused: Factors | None = None  # storage that repeated calls of `solve_once` share
         self.law = list(LAWS).index(law)
-        self.integration = Integration.of(mesh, integration)
-        cells, groups = len(mesh.hexes), len(self.integration.shares)
-        points = self.integration.points.gradient.reshape(cells, groups, 8, 8, 3)  # by group, point and node
-        self._by_point = np.ascontiguousarray(points.transpose(0, 1, 3, 4, 2)).reshape(cells, groups, 192)
-        self._by_node = np.ascontiguousarray(points.transpose(0, 1, 2, 4, 3)).reshape(cells, groups, 192)
-        self._volume = self.integration.points.volume.reshape(cells, groups, 8)
-        self._touching = np.flatnonzero(np.isin(mesh.hexes, fixed).any(axis=1))
+        self.quadrature = QuadratureRule.from_scheme(mesh, integration)
+        cells, groups = len(mesh.hexes), len(self.quadrature.group_shares)
+        gradient = self.quadrature.points.gradient.reshape(cells, groups, 8, 8, 3)  # (.., point, node, component)
+        self._gradients_by_point = np.ascontiguousarray(gradient.transpose(0, 1, 3, 4, 2)).reshape(cells, groups, 192)
+        self._gradients_by_node = np.ascontiguousarray(gradient.transpose(0, 1, 2, 4, 3)).reshape(cells, groups, 192)
+        self._volume = self.quadrature.points.volume.reshape(cells, groups, 8)
+        self._cells_at_fixed = np.flatnonzero(np.isin(mesh.hexes, fixed).any(axis=1))
 
     @contextmanager
-    def threads(self, batch: int) -> Iterator[None]:
-        """One thread where little is to be done: two would spend longer waiting than working."""
+    def thread_limit(self, batch: int) -> Iterator[None]:
+        """Context that uses one thread for a small batch: two would spend more time waiting than working."""
         before = numba.get_num_threads()
-        if batch * len(self.mesh.hexes) < CELLS_FOR_TWO:
+        if batch * len(self.mesh.hexes) < MIN_CELLS_FOR_TWO_THREADS:
             numba.set_num_threads(1)
         try:
             yield
@@ -57,41 +57,41 @@ class Compiled:
             numba.set_num_threads(before)
 
     @cached_property
-    def linear(self) -> LinearSolver:
-        """The direct solver of its tangent systems."""
-        return linear_solver(self.mesh, self.fixed)
+    def linear_solver(self) -> LinearSolver:
+        """The solver of the tangent systems."""
+        return choose_linear_solver(self.mesh, self.fixed)
 
     @property
     def free_index(self) -> NDArray[np.int64]:
         """Flat indices into (N * 3) of the unknowns, in the solver's order, (n)."""
-        return self.linear.free_index
+        return self.linear_solver.free_index
 
-    def terms(
-        self, q: Array, resistance: Resistance, *, tangent: bool, project: bool = False
+    def evaluate(
+        self, q: Array, state: ConstitutiveState, *, tangent: bool, project: bool = False
     ) -> tuple[Array, Array, Array]:
-        """Energy [J] (B), nodal gradient [N] (B, N, 3) and, if wanted, the cells' tangents [N/m].
+        """Energy [J] (B), nodal gradient [N] (B, N, 3) and, if `tangent`, the tangents of the cells [N/m].
 
-        Tangents are an opaque array for `factor`, `multiply` and `solve_once`; with `project` they are
-        positive semi-definite, else exact.
+        The tangents are opaque: pass them to `factor`, `multiply`, `reactions` or `solve_once`. They are exact, or
+        positive semi-definite if `project`.
         """
         batch = len(q)
         energy, gradient = np.empty(batch), np.empty_like(q)
         stiffness = np.empty((batch if tangent else 0, len(self.mesh.hexes), 6, 8, 8))
-        none = np.zeros((1, 1, 1, 1))
+        unused = np.zeros((1, 1, 1, 1))
         element_terms(
             q,
             self.mesh.hexes,
-            self._by_point,
-            self._by_node,
+            self._gradients_by_point,
+            self._gradients_by_node,
             self._volume,
-            self.integration.shares,
+            self.quadrature.group_shares,
             self.law,
-            resistance.moduli,
-            resistance.damped,
-            none[0] if resistance.drift is None else resistance.drift,
-            none if resistance.strain is None else resistance.strain,
-            resistance.rate,
-            resistance.strain_rate,
+            state.moduli,
+            state.damped,
+            unused[0] if state.velocity_offset is None else state.velocity_offset,
+            unused if state.strain_offset is None else state.strain_offset,
+            state.velocity_factor,
+            state.strain_factor,
             project,
             tangent,
             energy,
@@ -101,44 +101,44 @@ class Compiled:
         return energy, gradient, stiffness
 
     def multiply(self, tangents: Array, x: Array) -> Array:
-        """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
+        """Tangent times x, both (B, N, 3), on all nodes, including the fixed ones."""
         out = np.empty_like(x)
         multiply(tangents, np.arange(len(self.mesh.hexes)), self.mesh.hexes, x, out)
         return out
 
     def reactions(self, tangents: Array, x: Array) -> Array:
-        """Tangent times x (B, N, 3) on the held nodes, (B, F, 3)."""
+        """Tangent times x (B, N, 3) on the fixed nodes, (B, F, 3)."""
         out = np.empty_like(x)
-        multiply(tangents, self._touching, self.mesh.hexes, x, out)
+        multiply(tangents, self._cells_at_fixed, self.mesh.hexes, x, out)
         return out[:, self.fixed]
 
     @property
-    def patience(self) -> float:
-        """How many steps with an old factor cost as much as a new one."""
-        return self.linear.patience
+    def factorisation_cost(self) -> float:
+        """Number of Newton steps with a reused factor that cost as much as a new factor."""
+        return self.linear_solver.factorisation_cost
 
     def allocate(self, batch: int) -> Factors:
-        """Room for the factors of a batch."""
-        return self.linear.allocate(batch)
+        """Storage for the factors of a batch."""
+        return self.linear_solver.allocate(batch)
 
     def factor(self, factors: Factors, rows: Array, tangents: Array, diagonal: Array) -> NDArray[np.bool_]:
-        """Factor tangents plus a diagonal (R, n) into `rows`; True where positive definite."""
-        return self.linear.factor(factors, rows, tangents, diagonal)
+        """Factor tangents plus a diagonal (R, n) into `rows` of the storage; True where positive definite."""
+        return self.linear_solver.factor(factors, rows, tangents, diagonal)
 
     def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
-        """Solutions (R, C, n) of right sides (R, C, n)."""
-        return self.linear.solve(factors, rows, right)
+        """Solutions (R, C, n) of right-hand sides (R, C, n) with the factors in `rows`."""
+        return self.linear_solver.solve(factors, rows, right)
 
     def solve_once(self, tangents: Array, diagonal: Array, right: Array) -> Array:
-        """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""
+        """Solutions (B, C, n) with tangents, possibly indefinite, plus a diagonal (B, n)."""
         rows = np.arange(len(right))
-        if self._room is None or len(self._room.ready) != len(right):
-            self._room = self.allocate(len(right))
-        factors = self._room
+        if self._reused is None or len(self._reused.ready) != len(right):
+            self._reused = self.allocate(len(right))
+        factors = self._reused
         definite = self.factor(factors, rows, tangents, diagonal)
         solution = np.empty_like(right)
         if definite.any():
             solution[definite] = self.solve(factors, rows[definite], right[definite])
         for t in np.flatnonzero(~definite):
-            solution[t] = self.linear.solve_indefinite(tangents[t], diagonal[t], right[t])
+            solution[t] = self.linear_solver.solve_indefinite(tangents[t], diagonal[t], right[t])
         return solution

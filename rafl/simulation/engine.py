@@ -1,58 +1,59 @@
-"""What the simulator asks of its arithmetic; `rafl.simulation.compiled_engine` and `rafl.simulation.reference_engine` both answer."""
+"""Interface of the numerical engines: `rafl.simulation.compiled_engine` and `rafl.simulation.reference_engine`."""
 
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
+import numpy as np
 from numpy.typing import NDArray
 
-from rafl.fem.constitutive_state import Resistance
+from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.fem.mesh import HexMesh
-from rafl.fem.quadrature import Integration
+from rafl.fem.quadrature import QuadratureRule
 from rafl.solvers.linear import Factors
 
 Array = NDArray[Any]
 
 
 class Engine(Protocol):
-    """Energy, gradient, tangent and linear solves of one mesh under one law, for batches."""
+    """Energy, gradient, tangent and linear solves of one mesh with one elastic law, for batches."""
 
     mesh: HexMesh
-    integration: Integration
+    quadrature: QuadratureRule
 
     @property
     def free_index(self) -> Array:
         """Flat indices into (N * 3) of the unknowns, in the solver's order, (n)."""
 
     @property
-    def patience(self) -> float:
-        """How many steps with an old factor cost as much as a new one."""
+    def factorisation_cost(self) -> float:
+        """Number of Newton steps with a reused factor that cost as much as a new factor."""
 
-    def terms(
-        self, q: Array, resistance: Resistance, *, tangent: bool, project: bool = False
+    def evaluate(
+        self, q: Array, state: ConstitutiveState, *, tangent: bool, project: bool = False
     ) -> tuple[Array, Array, Any]:
-        """Energy [J] (B), nodal gradient [N] (B, N, 3) and, if wanted, tangents [N/m].
+        """Energy [J] (B), nodal gradient [N] (B, N, 3) and, if `tangent`, tangents [N/m].
 
-        Tangents are for `factor`, `multiply` and `solve_once` only; with `project` they are positive
-        semi-definite, else exact.
+        The tangents are opaque: pass them to `factor`, `multiply`, `reactions` or `solve_once`. They are exact, or
+        positive semi-definite if `project`.
         """
 
     def multiply(self, tangents: Any, x: Array) -> Array:
-        """Tangent times x, both (B, N, 3); all nodes, the held ones too."""
+        """Tangent times x, both (B, N, 3), on all nodes, including the fixed ones."""
 
     def reactions(self, tangents: Any, x: Array) -> Array:
-        """Tangent times x (B, N, 3) on the held nodes, (B, F, 3)."""
+        """Tangent times x (B, N, 3) on the fixed nodes, (B, F, 3)."""
 
-    def threads(self, batch: int) -> AbstractContextManager[None]:
-        """As many threads as a batch of this size is worth."""
+    def thread_limit(self, batch: int) -> AbstractContextManager[None]:
+        """Context that limits the number of threads to what suits a batch of this size."""
 
     def allocate(self, batch: int) -> Factors:
-        """Room for the factors of a batch."""
+        """Storage for the factors of a batch."""
 
-    def factor(self, factors: Factors, rows: Array, tangents: Any, diagonal: Array) -> NDArray:
-        """Factor tangents plus a diagonal (R, n) into `rows`; True where positive definite."""
+    def factor(self, factors: Factors, rows: Array, tangents: Any, diagonal: Array) -> NDArray[np.bool_]:
+        """Factor tangents plus a diagonal (R, n) into `rows` of the storage; True where positive definite."""
 
     def solve(self, factors: Factors, rows: Array, right: Array) -> Array:
-        """Solutions (R, C, n) of right sides (R, C, n)."""
+        """Solutions (R, C, n) of right-hand sides (R, C, n) with the factors in `rows`."""
 
     def solve_once(self, tangents: Any, diagonal: Array, right: Array) -> Array:
-        """Solutions (B, C, n) with tangents that may be indefinite, plus a diagonal (B, n)."""
+        """Solutions (B, C, n) with tangents, possibly indefinite, plus a diagonal (B, n)."""

@@ -1,18 +1,22 @@
-"""The bookkeeping of Newton's method between its large terms, compiled: a small body's step has hundreds of short
-arrays to combine, and each call of NumPy would cost as much as a cell's arithmetic."""
+"""Line search of Newton's method, compiled: a step of a small body combines hundreds of short arrays, and each NumPy
+call would cost as much as the arithmetic of one cell."""
 
 from typing import Any
 
 import numpy as np
 from numba import njit
 
-PLAIN: dict[str, Any] = {"cache": True, "error_model": "numpy"}  # sums exactly as they are written
-LEVEL = 1e-13  # of the energy's parts, what two equal energies may differ by
+# Without fastmath: sums keep the order in which they are written.
+EXACT_KERNEL_OPTIONS: dict[str, Any] = {"cache": True, "error_model": "numpy"}
+ENERGY_ROUNDING = 1e-13  # rounding error of an energy, relative to the sum of the magnitudes of its parts
 
 
-@njit(**PLAIN)
-def moved(q, rows, free, step, length):
-    """Positions (P, 3 N) of q (B, 3 N) at `rows` (P), their free places (n) moved by length (P) times step (P, n)."""
+@njit(**EXACT_KERNEL_OPTIONS)
+def trial_positions(q, rows, free, step, length):
+    """Trial positions (P, 3 N) of the trajectories `rows` (P) of q (B, 3 N).
+
+    The unknowns, at indices `free` (n), move by length (P) times step (P, n).
+    """
     trial = np.empty((len(rows), q.shape[1]))
     for p in range(len(rows)):
         trial[p] = q[rows[p]]
@@ -21,24 +25,27 @@ def moved(q, rows, free, step, length):
     return trial
 
 
-@njit(**PLAIN)
-def balance(at, gradient, free, inertia, target, force, residual):
-    """Fill one body's residual (n) [N]; its inertial energy, the forces' work [J] and the largest residual [N].
+@njit(**EXACT_KERNEL_OPTIONS)
+def fill_residual(at, gradient, free, inertia, target, force, residual):
+    """Fill the residual (n) [N] of one body, and sum its energies [J].
 
     Args:
         at, gradient: positions [m] and derivative of the elastic energy [N], (3 N).
-        free: places of the unknowns in them, (n).
+        free: indices of the unknowns in them, (n).
         inertia, target, force: [kg/s^2], [m], [N], (n).
         residual: output.
+
+    Returns:
+        Inertial energy [J], work of the external force [J], and largest residual component [N] or NaN if one is NaN.
     """
     inertial, work, largest, defined = 0.0, 0.0, 0.0, True
     for k in range(len(free)):
         x = at[free[k]]
         gap = x - target[k]
-        pull = inertia[k] * gap
-        inertial += 0.5 * pull * gap
+        inertial_force = inertia[k] * gap
+        inertial += 0.5 * inertial_force * gap
         work += force[k] * x
-        total = gradient[free[k]] + pull - force[k]
+        total = gradient[free[k]] + inertial_force - force[k]
         residual[k] = total
         size = abs(total)
         largest = max(largest, size)
@@ -46,75 +53,80 @@ def balance(at, gradient, free, inertia, target, force, residual):
     return inertial, work, largest if defined else np.nan
 
 
-@njit(**PLAIN)
-def begin(q, elastic, gradient, free, inertia, target, force, energy, residual, largest):
-    """Fill the energy (B), residual (B, n) and largest residual (B) of a batch where it is; arguments as of `judge`."""
+@njit(**EXACT_KERNEL_OPTIONS)
+def evaluate_start(q, elastic, gradient, free, inertia, target, force, energy, residual, largest):
+    """Fill energy (B), residual (B, n) and largest residual (B) at the start q; arguments as of `accept_trials`."""
     for b in range(len(q)):
-        inertial, work, size = balance(q[b], gradient[b].ravel(), free, inertia[b], target[b], force[b], residual[b])
+        inertial, work, size = fill_residual(
+            q[b], gradient[b].ravel(), free, inertia[b], target[b], force[b], residual[b]
+        )
         energy[b], largest[b] = elastic[b] + inertial - work, size
 
 
-@njit(**PLAIN)
-def judge(
+@njit(**EXACT_KERNEL_OPTIONS)
+def accept_trials(
     trial,
     elastic,
     gradient,
     rows,
-    old,
+    reused,
     length,
     slope,
     free,
     inertia,
     target,
     force,
-    stiffest,
-    reach,
-    enough,
-    patience,
+    max_stiffness,
+    position_error,
+    tolerance,
+    factorisation_cost,
     q,
     energy,
     residual,
     largest,
     ready,
 ):
-    """Take over the trials that are good enough; which are to be tried again, (P).
+    """Accept the trial positions that pass the test below; return which trials need a shorter step, (P).
 
-    A step by an old factor is good when it halves the residual and does not raise the energy; if it is not, the factor
-    is given up. One by a new factor is good when the energy falls by enough, and is to be tried again with another
-    length when it does not. Close to the minimum energies differ by rounding only: the residual decides there. A factor
-    is kept where at this pace the rest takes fewer steps than a new one costs.
+    A step with a reused factor passes if it halves the residual and does not raise the energy. If it fails, its factor
+    is discarded. A step with a new factor passes if the energy falls sufficiently (Armijo condition); if it fails, it
+    is tried again with another length. Near the minimum, energies differ by rounding only, so there a step with a new
+    factor also passes if it lowers the residual. A factor is kept if, at the present rate of convergence, the remaining
+    steps cost less than a new factorisation.
 
     Args:
         trial, elastic, gradient: positions (P, 3 N), their elastic energy (P) and its derivative (P, N, 3).
-        rows: of the batch, that are tried, (P).
-        old: whether by the factor of an earlier step, (P).
-        length, slope: of their steps, share of a whole one and derivative of the energy [J], (P).
-        free: places of the unknowns, (n).
-        inertia, target, force: (B, n).
-        stiffest, reach, enough: [N/m], [m], [N], (B).
-        patience: how many steps cost as much as a factor.
-        q, energy, residual, largest, ready: where each body is; changed where a trial is taken over.
+        rows: indices of the tried trajectories in the batch, (P).
+        reused: whether the step used the factor of an earlier step, (P).
+        length, slope: fraction of the full step, and derivative of the energy along it [J], (P).
+        free: indices of the unknowns, (n).
+        inertia, target, force: [kg/s^2], [m], [N], (B, n).
+        max_stiffness: bound on the stiffness [N/m], (B).
+        position_error: rounding error of positions [m], (B).
+        tolerance: residual at which a trajectory has converged [N], (B).
+        factorisation_cost: number of steps with a reused factor that cost as much as a new factor.
+        q, energy, residual, largest, ready: state of the batch; updated for each accepted trial.
     """
     again = np.zeros(len(rows), dtype=np.bool_)
     own = np.empty(len(free))
     for p in range(len(rows)):
         b = rows[p]
-        inertial, work, size = balance(trial[p], gradient[p].ravel(), free, inertia[b], target[b], force[b], own)
+        inertial, work, size = fill_residual(trial[p], gradient[p].ravel(), free, inertia[b], target[b], force[b], own)
         total = elastic[p] + inertial - work
         parts = abs(elastic[p]) + inertial + abs(work)
-        slack = LEVEL * parts + 10.0 * reach[b] * np.sqrt(stiffest[b] * parts)
-        level = total <= energy[b] + slack
-        if old[p]:
-            good = level and size <= 0.5 * largest[b]
+        slack = ENERGY_ROUNDING * parts + 10.0 * position_error[b] * np.sqrt(max_stiffness[b] * parts)
+        not_raised = total <= energy[b] + slack
+        if reused[p]:
+            accepted = not_raised and size <= 0.5 * largest[b]
         else:
-            good = total <= energy[b] + 1e-4 * length[p] * slope[p] or (level and size < largest[b])
-        if good:
+            accepted = total <= energy[b] + 1e-4 * length[p] * slope[p] or (not_raised and size < largest[b])
+        if accepted:
             shrinking = min(max(size / largest[b], 1e-300), 1.0)
-            ready[b] = np.log(max(size / enough[b], 1.0)) <= -patience * np.log(shrinking)
+            ready[b] = np.log(max(size / tolerance[b], 1.0)) <= -factorisation_cost * np.log(shrinking)
             q[b] = trial[p]
             energy[b], largest[b] = total, size
             residual[b] = own
         else:
-            again[p] = not old[p]
-            ready[b] = ready[b] and not old[p]
+            again[p] = not reused[p]
+            ready[b] = ready[b] and not reused[p]
     return again

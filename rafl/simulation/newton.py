@@ -6,19 +6,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.common.errors import SimulationError
-from rafl.fem.constitutive_state import Resistance
+from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.simulation.engine import Engine
-from rafl.simulation.line_search import begin, judge, moved
+from rafl.simulation.line_search import accept_trials, evaluate_start, trial_positions
 from rafl.solvers.linear import Factors
 
 Array = NDArray[Any]
 
-LONGEST = 0.3  # of an edge: what one step may change it by, lest the body snap through to another equilibrium
-TORN = 30.0  # of an edge: what nobody need try to follow
-TOLERANCE = 1e-10  # largest nodal residual accepted [N]
-ROUNDING = 8.0 * np.finfo(float).eps  # relative error allowed for in positions
+MAX_STEP_EDGE_CHANGE = 0.3  # rest edge lengths per step; a longer step may snap through to another equilibrium
+MAX_EDGE_CHANGE = 30.0  # rest edge lengths; a solution that exceeds it is rejected
+RESIDUAL_TOLERANCE = 1e-10  # largest residual component at convergence [N]
+POSITION_ROUNDING = 8.0 * np.finfo(float).eps  # relative rounding error allowed for in positions
 MAX_ITERATIONS = 200
-PROJECTED = (0.02, 0.1, 0.4, 1.0)  # shares of the projection tried where the exact tangent is indefinite
+MAX_LINE_SEARCH_TRIALS = 40
+PROJECTION_SHARES = (0.02, 0.1, 0.4, 1.0)  # shares of the projected tangent to try if the exact one is indefinite
 
 
 def minimise(
@@ -27,111 +28,111 @@ def minimise(
     inertia: Array,
     target: Array,
     force: Array,
-    resistance: Resistance,
-    what: str = "step",
+    state: ConstitutiveState,
+    label: str = "step",
     factors: Factors | None = None,
 ) -> Array:
-    """Positions minimising sum inertia/2 |q - target|^2 - force . q + the body's energy.
+    """Positions minimising sum inertia/2 |q - target|^2 - force . q + energy of the body.
 
-    Each trajectory of the batch goes its own way to a residual of 1e-10 N, or to what rounding of the
-    positions alone makes where that is more. A factor is used again while it contracts well enough to be
-    worth it. A new one is made of the exact tangent where the iterate then is, with as much of its positive
-    semi-definite projection as makes it definite, and its step is shortened until the energy falls.
+    Each trajectory of the batch converges on its own: to a residual of 1e-10 N, or to the residual that rounding of
+    the positions causes, if larger. A factor is reused as long as it contracts the residual fast enough. A new factor
+    is that of the exact tangent at the current positions. If that tangent is indefinite, the smallest sufficient share
+    of its positive semi-definite projection replaces it. The step is then shortened until the energy falls.
 
     Args:
-        engine: the arithmetic.
-        start: first guess, held nodes where they shall be [m], (B, N, 3).
+        engine: energy, derivatives and linear solves.
+        start: first guess, with the fixed nodes at their final positions [m], (B, N, 3).
         inertia: [kg/s^2], (B, N); zero for a static equilibrium.
         target: [m], (B, N, 3).
         force: nodal forces [N], (B, N, 3).
-        resistance: of each trajectory.
-        what: named in the error.
-        factors: those of the step before; used and replaced.
+        state: moduli and damping history of each trajectory.
+        label: name of the solve in error messages.
+        factors: those of the previous step; reused and replaced.
 
     Returns:
         Positions [m], (B, N, 3).
 
     Raises:
-        SimulationError: no convergence; names trajectory, residual and what to try.
+        SimulationError: no convergence; names trajectory, residual and remedies.
     """
-    problem = (engine, start, inertia, target, force, resistance, what, factors or engine.allocate(len(start)))
+    problem = (engine, start, inertia, target, force, state, label, factors or engine.allocate(len(start)))
     try:
-        found = _descend(*problem, LONGEST)
+        found = _minimise(*problem, MAX_STEP_EDGE_CHANGE)
     except SimulationError:
-        found = _descend(*problem, np.inf)  # from a start so squeezed that only a leap leads out
-    moved = found - engine.mesh.vertices
-    if (engine.mesh.stretching_at_most(np.abs(moved).max(axis=(1, 2))) < TORN).all():
+        found = _minimise(*problem, np.inf)  # from a strongly compressed start only a long step leads out
+    displacement = found - engine.mesh.vertices
+    if (engine.mesh.max_edge_change_bound(np.abs(displacement).max(axis=(1, 2))) < MAX_EDGE_CHANGE).all():
         return found
-    torn = engine.mesh.stretching(moved)
-    if not (torn < TORN).all():
+    change = engine.mesh.max_edge_change(displacement)
+    if not (change < MAX_EDGE_CHANGE).all():
         raise SimulationError(
-            f"{what}: trajectory {int(np.argmax(torn))} is torn apart (an edge changed by {torn.max():.3g} times its "
-            "length); the forces are not those of this body"
+            f"{label}: trajectory {int(np.argmax(change))} is torn apart (an edge changed by {change.max():.3g} times "
+            "its rest length); check that the forces belong to this body"
         )
     return found
 
 
-def _descend(
+def _minimise(
     engine: Engine,
     start: Array,
     inertia: Array,
     target: Array,
     force: Array,
-    resistance: Resistance,
-    what: str,
+    state: ConstitutiveState,
+    label: str,
     factors: Factors,
-    longest: float,
+    max_change: float,
 ) -> Array:
-    """`minimise` with steps that change no edge by more than `longest` times its length."""
+    """`minimise` with steps that change no edge by more than `max_change` times its rest length."""
     batch, shape = len(start), start.shape[1:]
     free = engine.free_index
     diagonal = np.take(np.repeat(inertia, 3, axis=1), free, axis=1)
-    pulls = (free, diagonal, *(np.take(x.reshape(batch, -1), free, axis=1) for x in (target, force)))
+    loads = (free, diagonal, *(np.take(x.reshape(batch, -1), free, axis=1) for x in (target, force)))
     q = start.reshape(batch, -1).copy()
-    stiffest = engine.integration.stiffest(resistance.moduli)
-    reach = ROUNDING * np.abs(q).max(axis=1)  # what rounding does to positions [m]
-    enough = np.maximum(TOLERANCE, stiffest * reach)
+    max_stiffness = engine.quadrature.max_rest_stiffness(state.moduli)
+    position_error = POSITION_ROUNDING * np.abs(q).max(axis=1)  # [m]
+    tolerance = np.maximum(RESIDUAL_TOLERANCE, max_stiffness * position_error)
     energy, largest, residual = np.empty(batch), np.empty(batch), np.empty_like(diagonal)
 
     def elastic(rows: Array, at: Array) -> tuple[Array, Array]:
-        """Elastic energy (P) and its derivative (P, N, 3) of positions (P, 3 N)."""
-        resisting = resistance if len(rows) == batch else resistance.rows(rows)
-        return engine.terms(at.reshape(-1, *shape), resisting, tangent=False)[:2]
+        """Elastic energy (P) and its derivative (P, N, 3) at positions (P, 3 N)."""
+        own = state if len(rows) == batch else state.select(rows)
+        return engine.evaluate(at.reshape(-1, *shape), own, tangent=False)[:2]
 
-    begin(q, *elastic(np.arange(batch), q), *pulls, energy, residual, largest)
+    evaluate_start(q, *elastic(np.arange(batch), q), *loads, energy, residual, largest)
     for _ in range(MAX_ITERATIONS):
-        running = np.flatnonzero(~(largest <= enough))
+        running = np.flatnonzero(~(largest <= tolerance))
         if not len(running):
             return q.reshape(start.shape)
         if not np.isfinite(largest[running]).all():
             break
-        old = factors.ready[running]
-        new = running[~old]
+        reused = factors.ready[running]
+        new = running[~reused]
         if len(new):
             at = q[new].reshape(-1, *shape)
-            _factor(engine, at, resistance.rows(new), factors, new, diagonal[new], what, largest[new])
-        down = residual[running]
-        step = -engine.solve(factors, running, down[:, None])[:, 0]
-        slope = np.einsum("ij,ij->i", step, down)
+            _factor(engine, at, state.select(new), factors, new, diagonal[new], label, largest[new])
+        right = residual[running]
+        step = -engine.solve(factors, running, right[:, None])[:, 0]
+        slope = np.einsum("ij,ij->i", step, right)
         length = np.ones(len(running))
-        far = np.flatnonzero(engine.mesh.stretching_at_most(np.abs(step).max(axis=1)) > longest)
+        far = np.flatnonzero(engine.mesh.max_edge_change_bound(np.abs(step).max(axis=1)) > max_change)
         if len(far):
-            change = engine.mesh.stretching(_scattered(step[far], free, q.shape[1]))
-            length[far] = np.minimum(1.0, longest / np.maximum(change, 1e-300))
-        for _ in range(40):
-            trial = moved(q, running, free, step, length)
-            again = judge(
+            change = engine.mesh.max_edge_change(_nodal(step[far], free, q.shape[1]))
+            length[far] = np.minimum(1.0, max_change / np.maximum(change, 1e-300))
+        for _ in range(MAX_LINE_SEARCH_TRIALS):
+            trial = trial_positions(q, running, free, step, length)
+            again = accept_trials(
                 trial,
                 *elastic(running, trial),
                 running,
-                old,
+                reused,
                 length,
                 slope,
-                *pulls,
-                stiffest,
-                reach,
-                enough,
-                engine.patience,
+                *loads,
+                max_stiffness,
+                position_error,
+                tolerance,
+                engine.factorisation_cost,
                 q,
                 energy,
                 residual,
@@ -140,21 +141,21 @@ def _descend(
             )
             if not again.any():
                 break
-            running, old, step, slope, length = (x[again] for x in (running, old, step, slope, 0.5 * length))
+            running, reused, step, slope, length = (x[again] for x in (running, reused, step, slope, 0.5 * length))
         else:
             break
-    open_ = np.flatnonzero(~(largest <= enough))
-    if not len(open_):
+    failed = np.flatnonzero(~(largest <= tolerance))
+    if not len(failed):
         return q.reshape(start.shape)
-    worst = open_[np.argmax(np.where(np.isfinite(largest[open_]), largest[open_], np.inf))]
+    worst = failed[np.argmax(np.where(np.isfinite(largest[failed]), largest[failed], np.inf))]
     raise SimulationError(
-        f"{what}: trajectory {worst} did not converge (residual {largest[worst]:.3g} N, "
-        f"wanted {enough[worst]:.0e} N); try a smaller time step, more substeps or a smaller load"
+        f"{label}: trajectory {worst} did not converge (residual {largest[worst]:.3g} N, "
+        f"limit {tolerance[worst]:.0e} N); try a smaller time step, more substeps or a smaller load"
     )
 
 
-def _scattered(step: Array, free: Array, unknowns: int) -> Array:
-    """Displacements (R, N, 3) of steps (R, n)."""
+def _nodal(step: Array, free: Array, unknowns: int) -> Array:
+    """Nodal displacements (R, N, 3) of steps of the unknowns (R, n)."""
     full = np.zeros((len(step), unknowns))
     full[:, free] = step
     return full.reshape(len(step), -1, 3)
@@ -163,22 +164,23 @@ def _scattered(step: Array, free: Array, unknowns: int) -> Array:
 def _factor(
     engine: Engine,
     q: Array,
-    resistance: Resistance,
+    state: ConstitutiveState,
     factors: Factors,
     rows: Array,
     diagonal: Array,
-    what: str,
+    label: str,
     largest: Array,
 ) -> None:
-    _, _, tangents = engine.terms(q, resistance, tangent=True)
+    """Factor the tangents at q into `rows` of the storage, made positive definite where needed."""
+    _, _, tangents = engine.evaluate(q, state, tangent=True)
     left = np.flatnonzero(~engine.factor(factors, rows, tangents, diagonal))
     if not len(left):
         return
-    # As little of the projection as will do: it is far too stiff in the direction the body buckles.
+    # Use the smallest sufficient share: the projected tangent is far too stiff in the direction of buckling.
     exact = tangents[left]
-    _, _, projected = engine.terms(q[left], resistance.rows(left), tangent=True, project=True)
-    shift = 1e-9 * engine.integration.stiffest(resistance.moduli[left])[:, None]
-    for share in PROJECTED:
+    _, _, projected = engine.evaluate(q[left], state.select(left), tangent=True, project=True)
+    shift = 1e-9 * engine.quadrature.max_rest_stiffness(state.moduli[left])[:, None]
+    for share in PROJECTION_SHARES:
         mixed = exact + share * (projected - exact)
         failed = ~engine.factor(factors, rows[left], mixed, diagonal[left] + shift)
         if not failed.any():
@@ -186,6 +188,6 @@ def _factor(
         exact, projected, shift, left = exact[failed], projected[failed], shift[failed], left[failed]
     worst = left[0]
     raise SimulationError(
-        f"{what}: trajectory {rows[worst]}: the tangent cannot be factored (residual "
-        f"{largest[worst]:.3g} N); hold more nodes or check the material"
+        f"{label}: trajectory {rows[worst]}: the tangent cannot be factored (residual "
+        f"{largest[worst]:.3g} N); fix more nodes or check the material"
     )

@@ -1,4 +1,4 @@
-"""The numbers a simulation is differentiable by, besides its state and its forces."""
+"""Material parameters and gravity as tensors, so that a simulation can be differentiated with respect to them."""
 
 from dataclasses import dataclass, fields
 from typing import Any
@@ -12,9 +12,9 @@ from rafl.fem.material import Material, lame
 
 @dataclass(frozen=True)
 class Parameters:
-    """Material and gravity as tensors: scalars, or one number a trajectory (B); gravity (3) or (B, 3).
+    """Material and gravity as tensors: scalars, or one number per trajectory (B); gravity (3) or (B, 3).
 
-    Units as in `rafl.fem.material.Material`; gravity in m/s^2.
+    Units are those of `rafl.fem.material.Material`; gravity in m/s^2.
     """
 
     youngs_modulus: Tensor
@@ -26,14 +26,14 @@ class Parameters:
     gravity: Tensor
 
     @classmethod
-    def of(cls, material: Material, field: tuple[float, float, float], **replacing: Any) -> "Parameters":
-        """Those of a material in a gravity field, some of them replaced by name."""
-        values = {item.name: getattr(material, item.name, field) for item in fields(cls)} | replacing
+    def of(cls, material: Material, gravity: tuple[float, float, float], /, **replacements: Any) -> "Parameters":
+        """Parameters of a material under gravity [m/s^2], some of them replaced by name."""
+        values = {item.name: getattr(material, item.name, gravity) for item in fields(cls)} | replacements
         return cls(**{key: torch.as_tensor(value, dtype=torch.float64) for key, value in values.items()})
 
     @property
     def damped(self) -> bool:
-        """Whether stiffness damping or viscosity is present, or wanted as a variable."""
+        """Whether stiffness damping or viscosity is non-zero or requires a gradient."""
         return any(
             value.requires_grad or bool((value.detach() != 0.0).any())
             for value in (self.stiffness_damping, self.viscosity)

@@ -7,25 +7,25 @@ import torch
 from torch import Tensor
 
 from rafl.common.errors import SimulationError
-from rafl.simulation.adjoint import Minimum, Setting
+from rafl.simulation.adjoint import SolveContext, implicit_solve
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.simulator import Simulator
-from rafl.simulation.time_integration import INTEGRATORS, ImplicitEuler, Problem, State, green_strain
+from rafl.simulation.time_integration import INTEGRATORS, ImplicitEuler, State, StepProblem, green_strain
 
 ResidualForce = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 
-FIRST_SHARE = 0.25  # of a step, over which the first acceleration is taken
+FIRST_ACCELERATION_FRACTION = 0.25  # of a step, over which the initial acceleration is averaged
 
 
 @dataclass(frozen=True)
 class Start:
-    """Where and under what a batch of trajectories starts.
+    """Initial state and constant loads of a batch of trajectories.
 
     Attributes:
         q, v: positions [m] and velocities [m/s], (B, N, 3).
-        force: constant nodal forces, gravity excepted [N], (B, N, 3).
-        added_mass: hung-on mass that swings along [kg], (B, N); its weight belongs to `force`.
+        force: constant nodal forces, without gravity [N], (B, N, 3).
+        added_mass: attached mass that moves with the nodes [kg], (B, N); `force` must include its weight.
         names: of the trajectories, for messages, (B).
     """
 
@@ -37,48 +37,53 @@ class Start:
 
 
 @dataclass(frozen=True)
-class _Body:
-    """A batch's material in the form that steps want it."""
+class _BodyBatch:
+    """Material of a batch, as the steps need it."""
 
     simulator: Simulator
     parameters: Parameters
     moduli: Tensor  # (B, 5)
-    mass: Tensor  # (B, N)
-    weight: Tensor  # (B, N, 3)
+    mass: Tensor  # [kg], (B, N)
+    weight: Tensor  # [N], (B, N, 3)
 
     @classmethod
-    def of(cls, simulator: Simulator, parameters: Parameters | None, added_mass: Tensor) -> "_Body":
+    def of(cls, simulator: Simulator, parameters: Parameters | None, added_mass: Tensor) -> "_BodyBatch":
         values = parameters or simulator.parameters()
         batch = len(added_mass)
-        own = values.density.expand(batch)[:, None] * torch.from_numpy(simulator.node_volume)
-        weight = own[..., None] * values.gravity.expand(batch, 3)[:, None]
+        own_mass = values.density.expand(batch)[:, None] * torch.from_numpy(simulator.node_volume)
+        weight = own_mass[..., None] * values.gravity.expand(batch, 3)[:, None]
         moduli = values.moduli(simulator.material.law, batch)
-        return cls(simulator, values, moduli, own + added_mass, weight)
+        return cls(simulator, values, moduli, own_mass + added_mass, weight)
 
-    def past(self, state: State, problem: Problem) -> tuple[Tensor, Tensor] | tuple[None, None]:
-        """Drift and strain history of a step, where there is damping."""
+    def damping_offsets(self, state: State, problem: StepProblem) -> tuple[Tensor, Tensor] | tuple[None, None]:
+        """Velocity and strain offsets of `rafl.fem.constitutive_state.ConstitutiveState`, or None without damping."""
         if not self.parameters.damped:
             return None, None
-        strain, change = self._strains(state)
-        return problem.drift, problem.strain_rate * strain + problem.strain_memory * change
+        strain, strain_rate = self._strains(state)
+        return problem.velocity_offset, problem.strain_factor * strain + problem.strain_rate_weight * strain_rate
 
     def _strains(self, state: State) -> tuple[Tensor, Tensor]:
-        mesh, points = self.simulator.mesh, self.simulator.engine.integration.points
+        mesh, points = self.simulator.mesh, self.simulator.engine.quadrature.points
         return green_strain(state.q, state.v, torch.from_numpy(mesh.hexes), torch.from_numpy(points.gradient))
 
-    def acceleration(self, state: State, force: Tensor, alpha: Tensor, held: Tensor, short: float) -> Tensor:
-        """What the free nodes start with under `force`, gravity included [m/s^2], (B, N, 3).
+    def initial_acceleration(
+        self, state: State, force: Tensor, alpha: Tensor, fixed_positions: Tensor, duration: float
+    ) -> Tensor:
+        """Initial acceleration of the free nodes under `force`, gravity included [m/s^2], (B, N, 3).
 
-        Taken over a short time [s] by backward differences, at whose end the held nodes are at `held` (B, F, 3): where
-        a body is let go forces jump, and would throw its stiffest modes farther than a whole step could take back.
+        It is averaged over a short duration [s] by backward differences; the fixed nodes end at `fixed_positions`
+        (B, F, 3). Forces jump where a body is released, and their exact acceleration would move its stiffest modes
+        farther than a whole step could correct.
         """
-        problem = ImplicitEuler().problem(state, self.mass, alpha, short)
-        drift, strain = self.past(state, problem)
-        setting = Setting(self.simulator, problem.guess, problem.rate, problem.strain_rate, "first acceleration")
-        x = Minimum.apply(problem.target, problem.inertia, force, held, self.moduli, drift, strain, setting)
+        problem = ImplicitEuler().problem(state, self.mass, alpha, duration)
+        offsets = self.damping_offsets(state, problem)
+        context = SolveContext(
+            self.simulator, problem.guess, problem.velocity_factor, problem.strain_factor, "initial acceleration"
+        )
+        x = implicit_solve(problem.target, problem.inertia, force, fixed_positions, self.moduli, *offsets, context)
         free = torch.ones(state.q.shape[1], 1, dtype=torch.float64)
         free[torch.from_numpy(self.simulator.fixed)] = 0.0
-        return free * ((x - state.q) / short - state.v) / short
+        return free * ((x - state.q) / duration - state.v) / duration
 
 
 def rollout(
@@ -91,26 +96,26 @@ def rollout(
 ) -> tuple[Tensor, Tensor]:
     """Simulate a batch of trajectories (paper, eq. 1 and 2), differentiably.
 
-    Gradients flow to the initial state, forces, added mass, every parameter, the clamp's motion and
-    whatever `residual` depends on.
+    Gradients flow to the initial state, forces, added mass, every parameter, the clamp's motion and everything that
+    `residual` depends on.
 
     Args:
         simulator: the specimen.
         start: initial state and loads.
         steps: number of time steps T.
-        residual: (q, v, external force, gravity included) -> nodal force (B, N, 3) [N], applied
-            explicitly: taken at the start of each time step and held through it.
-        parameters: other than the simulator's own (`simulator.parameters(...)`), also by trajectory.
-        clamp: where the held nodes are after each step [m], (T, B, F, 3); else they stay.
+        residual: (q, v, external force with gravity) -> nodal force (B, N, 3) [N]. It is applied explicitly: evaluated
+            at the start of each time step and constant during the step.
+        parameters: replace those of the simulator, see `simulator.parameters(...)`; may differ by trajectory.
+        clamp: positions of the fixed nodes after each step [m], (T, B, F, 3); without it they do not move.
 
     Returns:
-        Positions (T + 1, B, N, 3) [m] and residual forces (T, B, N, 3) [N] (zero-size without one).
+        Positions (T + 1, B, N, 3) [m] and residual forces (T, B, N, 3) [N], or an empty tensor without `residual`.
 
     Raises:
-        SimulationError: names trajectory, step and residual.
+        SimulationError: a step failed; names trajectory, step and residual.
     """
     integrator = INTEGRATORS[simulator.integrator]
-    body = _Body.of(simulator, parameters, start.added_mass)
+    body = _BodyBatch.of(simulator, parameters, start.added_mass)
     external = start.force + body.weight
     h = simulator.time_step / simulator.substeps
     alpha = body.parameters.mass_damping.expand(len(start.q))[:, None]
@@ -127,19 +132,25 @@ def rollout(
         if clamp is not None:
             begin = state.q[:, fixed]
         if step == 0 and integrator.uses_acceleration:
-            share = FIRST_SHARE / simulator.substeps
-            held = begin if clamp is None else (1.0 - share) * begin + share * clamp[0]
-            state = State(state.q, state.v, body.acceleration(state, force, alpha, held, FIRST_SHARE * h))
+            share = FIRST_ACCELERATION_FRACTION / simulator.substeps
+            fixed_positions = begin if clamp is None else (1.0 - share) * begin + share * clamp[0]
+            duration = FIRST_ACCELERATION_FRACTION * h
+            acceleration = body.initial_acceleration(state, force, alpha, fixed_positions, duration)
+            state = State(state.q, state.v, acceleration)
         for substep in range(simulator.substeps):
             problem = integrator.problem(state, body.mass, alpha, h)
-            held = begin
+            fixed_positions = begin
             if clamp is not None:
                 share = (substep + integrator.fraction) / simulator.substeps
-                held = (1.0 - share) * begin + share * clamp[step]
-            drift, strain = body.past(state, problem)
-            setting = Setting(simulator, problem.guess, problem.rate, problem.strain_rate, f"step {step + 1}", factors)
+                fixed_positions = (1.0 - share) * begin + share * clamp[step]
+            offsets = body.damping_offsets(state, problem)
+            context = SolveContext(
+                simulator, problem.guess, problem.velocity_factor, problem.strain_factor, f"step {step + 1}", factors
+            )
             try:
-                x = Minimum.apply(problem.target, problem.inertia, force, held, body.moduli, drift, strain, setting)
+                x = implicit_solve(
+                    problem.target, problem.inertia, force, fixed_positions, body.moduli, *offsets, context
+                )
             except SimulationError as error:
                 raise SimulationError(f"{error} [trajectories: {', '.join(start.names)}]") from None
             state = integrator.advance(state, x, h)
@@ -151,26 +162,26 @@ def equilibrium(
     simulator: Simulator,
     force: Tensor,
     parameters: Parameters | None = None,
-    held: Tensor | None = None,
-    what: str = "equilibrium",
+    fixed_positions: Tensor | None = None,
+    label: str = "equilibrium",
 ) -> Tensor:
-    """Static equilibrium [m], (B, N, 3), differentiable by forces, parameters and held positions.
+    """Static equilibrium [m], (B, N, 3), differentiable with respect to forces, parameters and fixed positions.
 
     Args:
         simulator: the specimen.
-        force: nodal forces, gravity excepted [N], (B, N, 3).
-        parameters: other than the simulator's own.
-        held: positions of the held nodes [m], (B, F, 3); else as at rest.
-        what: named in errors.
+        force: nodal forces, without gravity [N], (B, N, 3).
+        parameters: replace those of the simulator.
+        fixed_positions: positions of the fixed nodes [m], (B, F, 3); without them the nodes stay at rest.
+        label: name of the solve in error messages.
 
     Raises:
-        SimulationError: no convergence, not even with the load put on in steps.
+        SimulationError: no convergence, even with the load applied in steps.
     """
     batch, nodes = force.shape[:2]
-    body = _Body.of(simulator, parameters, force.new_zeros(batch, nodes))
-    if held is None:
-        held = torch.from_numpy(simulator.mesh.vertices[simulator.fixed]).expand(batch, -1, 3)
-    setting = Setting(simulator, None, what=what)
-    none = force.new_zeros(batch, nodes)
-    rest = torch.zeros_like(force)
-    return Minimum.apply(rest, none, force + body.weight, held, body.moduli, None, None, setting)
+    body = _BodyBatch.of(simulator, parameters, force.new_zeros(batch, nodes))
+    if fixed_positions is None:
+        fixed_positions = torch.from_numpy(simulator.mesh.vertices[simulator.fixed]).expand(batch, -1, 3)
+    context = SolveContext(simulator, None, label=label)
+    no_inertia = force.new_zeros(batch, nodes)
+    target = torch.zeros_like(force)
+    return implicit_solve(target, no_inertia, force + body.weight, fixed_positions, body.moduli, None, None, context)

@@ -1,4 +1,4 @@
-"""One specimen's mechanics: mesh, material, clamp, gravity, and how time is stepped."""
+"""Mechanics of one specimen: mesh, material, fixed nodes, gravity and time integration."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,42 +8,43 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.common.errors import SimulationError
-from rafl.fem.constitutive_state import Resistance
+from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
-from rafl.simulation.compiled_engine import Compiled
+from rafl.simulation.compiled_engine import CompiledEngine
 from rafl.simulation.engine import Engine
 from rafl.simulation.newton import minimise
 from rafl.simulation.parameters import Parameters
-from rafl.simulation.reference_engine import Plain
+from rafl.simulation.reference_engine import ReferenceEngine
 from rafl.simulation.time_integration import INTEGRATORS
 from rafl.solvers.linear import Factors
 
 Array = NDArray[Any]
 
-GRAVITY = (0.0, 0.0, -9.80709)
+GRAVITY = (0.0, 0.0, -9.80709)  # [m/s^2]
 ARITHMETIC = ("compiled", "plain")
-UPRIGHT = 0.02  # of gravity: what its component across a plane of symmetry may be
+MAX_GRAVITY_ACROSS = 0.02  # largest component of gravity normal to a symmetry plane, relative to its magnitude
+FIRST_LOAD_STEPS, MAX_LOAD_STEPS = 8, 64  # of an equilibrium whose load is applied in steps
 
 
 @dataclass(frozen=True)
 class Simulator:
-    """One specimen: a mesh of one material, held at some nodes, under gravity.
+    """One specimen: a mesh of one material, fixed at some nodes, under gravity.
 
     Attributes:
         mesh: the rest shape.
         material: elasticity, density, damping, and how mass is lumped.
-        fixed: indices of the held nodes, (F).
+        fixed: indices of the fixed nodes, (F).
         time_step: dt between frames [s].
         gravity: [m/s^2], (3).
         integrator: one of `rafl.simulation.time_integration.INTEGRATORS`.
-        substeps: steps of the integrator within dt.
-        arithmetic: `compiled` kernels on the processor, or `plain` tensors on `device`, which say the
-            same and are meant to be read, and to run on graphics cards.
-        device: of `plain` arithmetic, as torch names it.
+        substeps: number of integrator steps within dt.
+        arithmetic: `compiled` kernels on the CPU, or `plain` tensors on `device`. Both compute the same; the plain
+            tensors are the readable reference and run on GPUs.
+        device: torch device of the `plain` arithmetic.
 
     Raises:
-        ValueError: a name or number that is none of these.
+        ValueError: an unknown name, or a number out of range.
     """
 
     mesh: HexMesh
@@ -66,8 +67,8 @@ class Simulator:
             raise ValueError(f"expected time_step > 0 and substeps >= 1, got {self.time_step} and {self.substeps}")
 
     @property
-    def stepping(self) -> dict[str, Any]:
-        """How time is stepped, by the names of this class."""
+    def time_integration(self) -> dict[str, Any]:
+        """Settings of the time integration, by attribute name."""
         return {"integrator": self.integrator, "substeps": self.substeps}
 
     @cached_property
@@ -75,41 +76,43 @@ class Simulator:
         """Energy, gradient, tangent and linear solves."""
         material = self.material
         if self.arithmetic == "plain":
-            return Plain(self.mesh, material.law, material.integration, self.fixed, self.device)
-        return Compiled(self.mesh, material.law, material.integration, self.fixed)
+            return ReferenceEngine(self.mesh, material.law, material.integration, self.fixed, self.device)
+        return CompiledEngine(self.mesh, material.law, material.integration, self.fixed)
 
     @cached_property
     def node_volume(self) -> Array:
-        """What, times density, is each node's mass [m^3], (N,)."""
+        """Nodal volumes [m^3], (N,): nodal masses divided by density."""
         return self.material.node_volume(self.mesh)
 
     @property
     def node_mass(self) -> Array:
         """Nodal masses [kg], (N,)."""
-        return self.material.density * self.node_volume
+        mass: Array = self.material.density * self.node_volume
+        return mass
 
     @property
-    def mirrors(self) -> NDArray[np.bool_]:
-        """Whether the specimen, as it is held and as gravity pulls, is its own mirror image across each axis, (3)."""
-        across = np.abs(self.gravity) <= UPRIGHT * np.linalg.norm(self.gravity)
-        return self.mesh.mirrors(self.fixed) & across
+    def symmetry_planes(self) -> NDArray[np.bool_]:
+        """Whether mesh, fixed nodes and gravity are symmetric about the mid-plane normal to each axis, (3)."""
+        in_plane = np.abs(self.gravity) <= MAX_GRAVITY_ACROSS * np.linalg.norm(self.gravity)
+        return self.mesh.symmetry_planes(self.fixed) & in_plane
 
     @property
     def weight(self) -> Array:
         """Nodal gravity forces [N], (N, 3)."""
-        return self.node_mass[:, None] * np.asarray(self.gravity)
+        weight: Array = self.node_mass[:, None] * np.asarray(self.gravity)
+        return weight
 
-    def parameters(self, **replacing: Any) -> Parameters:
+    def parameters(self, **replacements: Any) -> Parameters:
         """Material and gravity as tensors, some replaced by name, for `rafl.simulation.rollout`."""
-        return Parameters.of(self.material, self.gravity, **replacing)
+        return Parameters.of(self.material, self.gravity, **replacements)
 
-    def resistance(self, batch: int) -> Resistance:
-        """The material's elasticity, without damping, for a batch."""
-        return Resistance(self.parameters().moduli(self.material.law, batch).numpy())
+    def constitutive_state(self, batch: int) -> ConstitutiveState:
+        """Elastic moduli of the material, without damping, for a batch."""
+        return ConstitutiveState(self.parameters().moduli(self.material.law, batch).numpy())
 
     def elastic_gradient(self, q: Array) -> Array:
-        """Derivative of the elastic energy by q [N], (B, N, 3); minus the internal force."""
-        return self.engine.terms(q, self.resistance(len(q)), tangent=False)[1]
+        """Derivative of the elastic energy with respect to q [N], (B, N, 3)."""
+        return self.engine.evaluate(q, self.constitutive_state(len(q)), tangent=False)[1]
 
     def minimise(
         self,
@@ -117,53 +120,57 @@ class Simulator:
         inertia: Array,
         target: Array,
         force: Array,
-        resistance: Resistance,
-        what: str,
+        state: ConstitutiveState,
+        label: str,
         factors: Factors | None = None,
     ) -> Array:
-        """`rafl.simulation.newton.minimise` with this specimen's arithmetic."""
-        with self.engine.threads(len(start)):
-            return minimise(self.engine, start, inertia, target, force, resistance, what, factors)
+        """`rafl.simulation.newton.minimise` with the engine of this specimen."""
+        with self.engine.thread_limit(len(start)):
+            return minimise(self.engine, start, inertia, target, force, state, label, factors)
 
     def equilibrium(
-        self, force: Array, start: Array | None = None, what: str = "equilibrium", resistance: Resistance | None = None
+        self,
+        force: Array,
+        start: Array | None = None,
+        label: str = "equilibrium",
+        state: ConstitutiveState | None = None,
     ) -> Array:
         """Static equilibrium [m], (B, N, 3), under nodal forces (B, N, 3) [N], gravity included.
 
-        Held nodes stay where `start` (B, N, 3) has them, or at rest. Where Newton's method fails at
-        once the load is put on in steps, more of them where it must be.
+        The fixed nodes stay at their positions in `start` (B, N, 3), or at rest without it. If Newton's method fails
+        under the full load, the load is applied in steps, and the number of steps is doubled until it succeeds.
 
         Raises:
-            SimulationError: not even in 64 steps.
+            SimulationError: no convergence with 64 load steps.
         """
-        resistance = resistance or self.resistance(len(force))
-        none = np.zeros(force.shape[:2])
+        state = state or self.constitutive_state(len(force))
+        no_inertia = np.zeros(force.shape[:2])
         begin = np.broadcast_to(self.mesh.vertices, force.shape).copy() if start is None else start
         try:
-            return self.minimise(begin, none, begin, force, resistance, what)
+            return self.minimise(begin, no_inertia, begin, force, state, label)
         except SimulationError:
             pass
-        shape = np.broadcast_to(self.mesh.vertices, force.shape).copy()
-        steps = 8
+        rest = np.broadcast_to(self.mesh.vertices, force.shape).copy()
+        steps = FIRST_LOAD_STEPS
         while True:
             try:
-                q = shape
+                q = rest
                 for share in np.linspace(1.0 / steps, 1.0, steps):
                     q = q.copy()
-                    q[:, self.fixed] = (1.0 - share) * shape[:, self.fixed] + share * begin[:, self.fixed]
-                    q = self.minimise(q, none, q, share * force, resistance, f"{what} at {share:.0%} of the load")
+                    q[:, self.fixed] = (1.0 - share) * rest[:, self.fixed] + share * begin[:, self.fixed]
+                    q = self.minimise(q, no_inertia, q, share * force, state, f"{label} at {share:.0%} of the load")
                 return q
             except SimulationError:
-                if steps >= 64:
+                if steps >= MAX_LOAD_STEPS:
                     raise
                 steps *= 2
 
     def solve_tangent(self, q: Array, right: Array) -> Array:
-        """Solve K x = right on the free nodes, K the exact static tangent at q; zero on the held ones.
+        """Solve K x = right on the free nodes, with K the exact static tangent at q; x is zero on the fixed nodes.
 
-        q (B, N, 3); right (B, N, 3) [N] or, with further columns, (B, N, 3, C).
+        q (B, N, 3) [m]; right (B, N, 3) [N] or, with C columns, (B, N, 3, C).
         """
-        tangents = self.engine.terms(q, self.resistance(len(q)), tangent=True)[2]
+        tangents = self.engine.evaluate(q, self.constitutive_state(len(q)), tangent=True)[2]
         free = self.engine.free_index
         columns = right.reshape(len(q), -1, int(np.prod(right.shape[3:])))  # (B, 3 N, C)
         solution = self.engine.solve_once(

@@ -2,7 +2,7 @@
 
     python tests/reference/check.py ../shared/reference
 
-A line a file: its name, the largest deviation, the limit. Exits 1 where one is past its limit.
+Prints one line per file: name, largest deviation relative to its limit, limit. Exits with 1 if a limit is exceeded.
 """
 
 import sys
@@ -23,16 +23,16 @@ from rafl.residual.features import GaussPoints, features
 from rafl.simulation.rollout import Start, rollout
 from rafl.simulation.simulator import Simulator
 
-TRAJECTORY_LIMIT = 1e-9  # m
-GRADIENT_LIMIT = 1e-6  # of the largest component
-FIELD_LIMIT = 1e-9  # of the largest component
+TRAJECTORY_LIMIT = 1e-9  # [m]
+GRADIENT_LIMIT = 1e-6  # relative to the largest component
+FIELD_LIMIT = 1e-9  # relative to the largest component
 
 
 @dataclass(frozen=True)
 class Deviation:
-    """How far one quantity of a file is from ours."""
+    """Deviation of the simulator from the reference in one quantity."""
 
-    what: str
+    quantity: str
     value: float
     limit: float
     unit: str
@@ -49,7 +49,7 @@ def simulator_of(data: dict[str, np.ndarray]) -> Simulator:
 
 
 def simulate(data: dict[str, np.ndarray], **leaves: Tensor) -> Tensor:
-    """Positions (T, N, 3); f_ext constant (N, 3) or by step (T - 1, N, 3)."""
+    """Positions (T, N, 3); f_ext is constant (N, 3) or given per step (T - 1, N, 3)."""
     simulator = simulator_of(data)
     q, v, force = (
         leaves.get(key, torch.from_numpy(value))
@@ -61,13 +61,13 @@ def simulate(data: dict[str, np.ndarray], **leaves: Tensor) -> Tensor:
     )
     steps = len(force) if force.ndim == 3 else len(data["q"]) - 1
     mass = data.get("node_mass", simulator.node_mass)
-    more = torch.from_numpy(np.broadcast_to(mass, simulator.node_mass.shape) - simulator.node_mass)
+    extra = torch.from_numpy(np.broadcast_to(mass, simulator.node_mass.shape) - simulator.node_mass)
     gravity = torch.tensor(simulator.gravity, dtype=torch.float64)
-    constant = more[:, None] * gravity + (force if force.ndim == 2 else 0.0)
+    constant = extra[:, None] * gravity + (force if force.ndim == 2 else 0.0)
     loads = iter(force)
     residual = (lambda q, v, external: next(loads)[None]) if force.ndim == 3 else None
     values = {key: value for key, value in leaves.items() if key not in ("q0", "v0", "f_ext")}
-    start = Start(q[None], v[None], constant[None], more[None], ("reference",))
+    start = Start(q[None], v[None], constant[None], extra[None], ("reference",))
     return rollout(simulator, start, steps, residual, simulator.parameters(**values))[0][:, 0]
 
 
@@ -85,7 +85,7 @@ def gradient(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
     loss = ((q[1:] - torch.tensor(data["vertices"])) ** 2).sum()
     loss.backward()
     found = {"loss": loss.item()} | {f"d_{key}": leaf.grad.numpy() for key, leaf in leaves.items()}
-    # 2 mu and lambda are functions of E and nu: their derivatives follow from the two.
+    # Derivatives with respect to 2 mu and lambda follow from those with respect to E and nu.
     e, nu = (torch.tensor(float(data[key]), dtype=torch.float64).requires_grad_() for key in names[:2])
     mu, lam = lame(e, nu)
     jacobian = np.array([[float(g) for g in torch.autograd.grad(x, (e, nu), retain_graph=True)] for x in (2 * mu, lam)])
@@ -103,10 +103,10 @@ def gradient(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
 def residual_field(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
     """Features, force and their derivatives.
 
-    The files' derivatives by the weights are those of L + 2 sum(force at exact rest): two earlier
-    gradients had not been set to zero. (The last layer is linear, so sum(W4 * dL/dW4) must be L, which
-    theirs is not.) Either reading is accepted; at rest their features hold 1e-10 where a root was
-    regularised, so this one agrees to 1e-8 only.
+    The derivatives in the files with respect to the weights are those of L + 2 sum(force at exact rest): two earlier
+    gradients had not been set to zero. (The last layer is linear, so sum(W4 * dL/dW4) must be L, but theirs is not.)
+    Agreement with either L or this sum is accepted. At rest their features are 1e-10 where a square root was
+    regularised, so the sum agrees to 1e-8 only.
     """
     mesh = HexMesh(data["vertices"], data["hexes"].astype(np.int64))
     simulator = Simulator(mesh, Material(), mesh.face_nodes("x-min"))
@@ -117,23 +117,23 @@ def residual_field(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
     q, v = (torch.tensor(data[key])[None].requires_grad_() for key in ("q", "v"))
     gravity = torch.tensor(simulator.gravity, dtype=torch.float64)
     values, _ = features(q, v, GaussPoints.of(mesh, simulator.material.density), gravity)
-    none = torch.zeros_like(q)
-    force = field.on(simulator)(q, v, none)
+    zeros = torch.zeros_like(q)
+    force = field.on(simulator)(q, v, zeros)
     by_q, by_v, *by_weights = torch.autograd.grad((force * torch.tensor(data["c"])).sum(), [q, v, *weights])
-    for what, ours, theirs in (
+    for quantity, ours, theirs in (
         ("features", values[0], data["features"]),
         ("force", force[0], data["force"]),
         ("d_q", by_q[0], data["d_q"]),
         ("d_v", by_v[0], data["d_v"]),
     ):
         difference = np.abs(ours.detach().numpy() - theirs).max()
-        yield Deviation(what, float(difference / np.abs(theirs).max()), FIELD_LIMIT, "relative")
+        yield Deviation(quantity, float(difference / np.abs(theirs).max()), FIELD_LIMIT, "relative")
     rest = torch.from_numpy(mesh.vertices)[None]
-    at_rest = torch.autograd.grad(field.on(simulator)(rest, none, none).sum(), weights)
+    at_rest = torch.autograd.grad(field.on(simulator)(rest, zeros, zeros).sum(), weights)
     readings = [
         max(
-            float(np.abs((mine + times * more).numpy() - data[f"d_W{n}"]).max() / np.abs(data[f"d_W{n}"]).max())
-            for n, (mine, more) in enumerate(zip(by_weights, at_rest, strict=True))
+            float(np.abs((mine + times * extra).numpy() - data[f"d_W{n}"]).max() / np.abs(data[f"d_W{n}"]).max())
+            for n, (mine, extra) in enumerate(zip(by_weights, at_rest, strict=True))
         )
         for times in (0.0, 2.0)
     ]
@@ -141,11 +141,11 @@ def residual_field(data: dict[str, np.ndarray]) -> Iterator[Deviation]:
 
 
 def deviations(path: Path) -> list[Deviation] | None:
-    """Of a file's quantities; None where the file is no reference of a known kind."""
+    """Deviations of the quantities in a file; None if it is no reference file of a known kind."""
     with np.load(path) as file:
         data = dict(file)
-    for mark, compare in (("features", residual_field), ("d_q0", gradient), ("f_ext", trajectory)):
-        if mark in data:
+    for key, compare in (("features", residual_field), ("d_q0", gradient), ("f_ext", trajectory)):
+        if key in data:
             return list(compare(data))
     return None
 
@@ -174,7 +174,7 @@ def main() -> int:
         passed = all(item.passed for item in found)
         failed |= not passed
         print(
-            f"{path.name:48s} {worst.what:>10s} {worst.value:.2e} {worst.unit}, "
+            f"{path.name:48s} {worst.quantity:>10s} {worst.value:.2e} {worst.unit}, "
             f"limit {worst.limit:.0e}{'' if passed else '  FAILED'}"
         )
     return int(failed)

@@ -1,4 +1,4 @@
-"""Trajectories, gradients and forces of the paper's own simulator."""
+"""Comparison with trajectories, gradients and forces of the paper's simulator."""
 
 import importlib.util
 import sys
@@ -17,13 +17,13 @@ _spec = importlib.util.spec_from_file_location("reference_check", Path(__file__)
 assert _spec is not None
 assert _spec.loader is not None
 check = importlib.util.module_from_spec(_spec)
-sys.modules[_spec.name] = check  # dataclasses look their module up
+sys.modules[_spec.name] = check  # dataclasses look up their module there
 _spec.loader.exec_module(check)
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.npz")) if FOLDER.is_dir() else [], ids=lambda path: path.stem)
-def test_every_quantity_of_every_file(path: Path) -> None:
+def test_deviations_are_within_the_limits(path: Path) -> None:
     found = check.deviations(path)
-    assert found, f"{path.name} is no reference of a known kind"
+    assert found, f"{path.name} is no reference file of a known kind"
     for item in found:
-        assert item.passed, f"{item.what}: {item.value:.2e} {item.unit}, limit {item.limit:.0e}"
+        assert item.passed, f"{item.quantity}: {item.value:.2e} {item.unit}, limit {item.limit:.0e}"

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.residual.acceleration_field import ResidualField
-from rafl.residual.features import GaussPoints, _PolarStretch, features
+from rafl.residual.features import GaussPoints, features, polar_decomposition
 from rafl.simulation.simulator import Simulator
 
 G = torch.tensor([0.0, 0.0, -9.8], dtype=torch.float64)
@@ -29,12 +29,12 @@ def field(mesh: HexMesh) -> tuple[ResidualField, Simulator]:
     ids=["rest", "repeated", "thin"],
 )
 def test_polar_backward_by_finite_differences(F: np.ndarray, random: np.random.Generator) -> None:
-    """R, and the sum of squares of the stretches, which is smooth where they cross."""
+    """For R and the sum of squared stretches, which is smooth where stretches cross."""
     at = torch.tensor(Rotation.from_rotvec([0.3, 0.2, -0.5]).as_matrix() @ F)[None].requires_grad_()
     weights = torch.tensor(random.normal(size=(3, 3)))
 
     def value(F: torch.Tensor) -> torch.Tensor:
-        R, s = _PolarStretch.apply(F)
+        R, s = polar_decomposition(F)
         return (R * weights).sum() + (s**2).sum()
 
     assert torch.autograd.gradcheck(value, (at,), eps=1e-6, atol=1e-6)
@@ -52,7 +52,7 @@ def test_features_and_gradients_are_finite_at_exact_rest(mesh: HexMesh) -> None:
 
 
 def test_features_of_a_known_motion(mesh: HexMesh) -> None:
-    """q = A x with A = R diag(1.1, 0.9, 1), v = B q: F = A, L = B everywhere."""
+    """q = A x with A = R diag(1.1, 0.9, 1) and v = B q, so F = A and L = B everywhere."""
     R = Rotation.from_rotvec([0.5, -0.3, 0.8]).as_matrix()
     A = R @ np.diag([1.1, 0.9, 1.0])
     B = np.array([[0.1, 0.4, 0.0], [-0.2, 0.3, 0.5], [0.1, 0.0, -0.6]])
@@ -81,25 +81,27 @@ def test_features_of_a_known_motion(mesh: HexMesh) -> None:
     np.testing.assert_allclose(one, expected, atol=1e-12)
 
 
-def test_force_turns_with_the_body(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
+def test_force_rotates_with_the_body(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
     model, simulator = field
-    turn = torch.tensor(Rotation.from_rotvec([0.2, 1.0, -0.4]).as_matrix())
+    rotation = torch.tensor(Rotation.from_rotvec([0.2, 1.0, -0.4]).as_matrix())
     q = torch.tensor(simulator.mesh.vertices + random.normal(0, 1e-3, simulator.mesh.vertices.shape))[None]
     v = torch.tensor(random.normal(0, 0.2, q.shape))
-    gx, gy, gz = (turn @ torch.tensor(simulator.gravity, dtype=torch.float64)).tolist()
-    turned = Simulator(simulator.mesh, simulator.material, simulator.fixed, gravity=(gx, gy, gz))
+    gx, gy, gz = (rotation @ torch.tensor(simulator.gravity, dtype=torch.float64)).tolist()
+    rotated = Simulator(simulator.mesh, simulator.material, simulator.fixed, gravity=(gx, gy, gz))
     force = model.on(simulator)(q, v, 0 * q)
-    torch.testing.assert_close(model.on(turned)(q @ turn.T, v @ turn.T, 0 * q), force @ turn.T, atol=1e-12, rtol=1e-9)
+    torch.testing.assert_close(
+        model.on(rotated)(q @ rotation.T, v @ rotation.T, 0 * q), force @ rotation.T, atol=1e-12, rtol=1e-9
+    )
 
 
 @pytest.mark.parametrize("mirrors", [[False, True, False], [False, True, True], [True, True, True]])
-def test_mirrored_motion_meets_the_mirrored_force(
+def test_mirrored_motion_gives_the_mirrored_force(
     mesh: HexMesh, mirrors: list[bool], random: np.random.Generator
 ) -> None:
-    """Across every axis that the field is mirrored in, gravity included; not across the others."""
+    """With mirrored gravity, and only for the axes in which the field is symmetric."""
     torch.manual_seed(3)
     model = ResidualField()
-    model.mirror(torch.tensor(mirrors))
+    model.impose_symmetry(torch.tensor(mirrors))
     q = mesh.vertices + random.normal(0, 1e-3, mesh.vertices.shape)
     v = random.normal(0, 0.2, q.shape)
     gravity = np.array([1.0, 3.0, -9.0])
@@ -120,7 +122,7 @@ def test_mirrored_motion_meets_the_mirrored_force(
         assert np.allclose(found, expected, rtol=1e-9, atol=1e-9 * np.abs(expected).max()) == mirrored
 
 
-def test_units_that_cannot_change_places_are_refused() -> None:
+def test_width_must_be_a_multiple_of_eight() -> None:
     with pytest.raises(ValueError, match="multiple of 8, got 20"):
         ResidualField(width=20)
 
@@ -143,31 +145,31 @@ def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], ran
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-@pytest.mark.parametrize("still", [True, False])
-def test_compiled_field_is_the_plain_one(still: bool, mirrored: bool, random: np.random.Generator) -> None:
-    """Forces and every derivative of several bent states, at rest too, on cells of different shapes."""
+@pytest.mark.parametrize("at_rest", [True, False])
+def test_compiled_and_reference_fields_agree(at_rest: bool, mirrored: bool, random: np.random.Generator) -> None:
+    """Forces and all derivatives of several deformed states, and at rest, on a mesh with a missing cell."""
     torch.manual_seed(1)
     model = ResidualField()
     model.scale.copy_(torch.linspace(0.5, 20.0, 34))
-    model.mirror(torch.tensor([False, mirrored, mirrored]))
+    model.impose_symmetry(torch.tensor([False, mirrored, mirrored]))
     cells = np.ones((3, 2, 2), dtype=bool)
     cells[2, 1] = False
     mesh = HexMesh.from_grid(cells, (0.01, 0.012, 0.008))
     simulator = Simulator(mesh, Material(), mesh.face_nodes("x-min"))
-    moves = 0.0 if still else random.normal(0, 2e-3, (3, *mesh.vertices.shape))
+    moves = 0.0 if at_rest else random.normal(0, 2e-3, (3, *mesh.vertices.shape))
     q = torch.tensor(mesh.vertices + moves + np.zeros((3, 1, 1)))
-    v = torch.tensor(random.normal(0, 0.3, q.shape) * (not still))
+    v = torch.tensor(random.normal(0, 0.3, q.shape) * (not at_rest))
     c = torch.tensor(random.normal(size=q.shape))
     results = []
-    for force in (model.on(simulator), model.plainly_on(simulator)):
+    for force in (model.on(simulator), model.reference_on(simulator)):
         leaves = [q.clone().requires_grad_(), v.clone().requires_grad_()]
         value = force(*leaves, 0 * q)
         results.append([value, *torch.autograd.grad((value * c).sum(), [*leaves, *model.parameters()])])
-    for number, (compiled, plain) in enumerate(zip(*results, strict=True)):
+    for number, (compiled, reference) in enumerate(zip(*results, strict=True)):
         assert torch.isfinite(compiled).all()
-        if still and number == 1:
-            continue  # where all stretches are equal, which of them is the smallest has no derivative
-        torch.testing.assert_close(compiled, plain, rtol=1e-8, atol=1e-11 * float(plain.detach().abs().max()))
+        if at_rest and number == 1:
+            continue  # for equal stretches the order, and so the derivative of each feature, is not unique
+        torch.testing.assert_close(compiled, reference, rtol=1e-8, atol=1e-11 * float(reference.detach().abs().max()))
 
 
 def test_weights_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:
@@ -190,26 +192,26 @@ def test_weights_by_finite_differences(field: tuple[ResidualField, Simulator], r
         assert gradient == pytest.approx((values[0] - values[1]) / 2e-6, rel=1e-5)
 
 
-def test_a_uniform_acceleration_weighs_the_body(mesh: HexMesh) -> None:
-    """Accumulating the same acceleration everywhere gives total force = mass * acceleration."""
+def test_uniform_acceleration_gives_mass_times_acceleration(mesh: HexMesh) -> None:
+    """The nodal forces of a uniform acceleration add up to mass * acceleration."""
     points = GaussPoints.of(mesh, 1000.0)
     acceleration = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64).expand(1, len(mesh.hexes), 8, 3)
     force = points.accumulate(acceleration, len(mesh.vertices))
     np.testing.assert_allclose(force[0].sum(0).numpy(), 0.016 * np.array([1.0, 2.0, 3.0]))
 
 
-def test_scaled_features_have_no_units_and_no_giants(random: np.random.Generator) -> None:
-    """Rates in other units are the same inputs, and a feature that training hardly excites is not the loudest."""
+def test_scaled_features_are_dimensionless_and_balanced(random: np.random.Generator) -> None:
+    """The inputs do not depend on the unit of rates, and features that training hardly excites do not dominate."""
     model, size = ResidualField(), torch.tensor(random.uniform(0.5, 2.0, 34))
     size[[5, 20]] = torch.tensor([1e-9, 0.0], dtype=torch.float64)
-    model.scale_to(size)
+    model.set_scale(size)
     inputs = model.scale * size
     other = size.clone()
     other[13:31] *= 1000.0
-    model.scale_to(other)
+    model.set_scale(other)
     assert torch.allclose(model.scale * other, inputs)
     assert model.scale[:13].max() < 50.0 * model.scale[:13].min()
     without_gravity = size.clone()
     without_gravity[31:] = 0.0
-    model.scale_to(without_gravity)
+    model.set_scale(without_gravity)
     assert torch.isfinite(model.scale).all()

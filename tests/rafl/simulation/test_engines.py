@@ -1,4 +1,4 @@
-"""The compiled kernels against the plain tensors that specify them."""
+"""Comparison of the compiled engine with the reference engine."""
 
 from itertools import product
 
@@ -7,12 +7,12 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rafl.fem.constitutive_state import Resistance
+from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.fem.laws import LAWS
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
-from rafl.simulation.compiled_engine import Compiled
-from rafl.simulation.reference_engine import Plain
+from rafl.simulation.compiled_engine import CompiledEngine
+from rafl.simulation.reference_engine import ReferenceEngine
 from rafl.simulation.rollout import Start, rollout
 from rafl.simulation.simulator import Simulator
 
@@ -21,7 +21,7 @@ FIXED = MESH.face_nodes("x-min")
 
 
 def states(random: np.random.Generator) -> np.ndarray:
-    """At rest, shaken, turned, squeezed to near inversion and inside out (5, N, 3)."""
+    """At rest, perturbed, perturbed and rotated, compressed to near inversion, and inverted (5, N, 3)."""
     rest = MESH.vertices
     turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
     shaken = rest + random.normal(0, 1e-3, rest.shape)
@@ -31,55 +31,57 @@ def states(random: np.random.Generator) -> np.ndarray:
     return np.stack([rest, shaken, shaken @ turn.T, flat, inverted])
 
 
-def engines(law: str, integration: str) -> tuple[Compiled, Plain]:
-    return Compiled(MESH, law, integration, FIXED), Plain(MESH, law, integration, FIXED)
+def engines(law: str, integration: str) -> tuple[CompiledEngine, ReferenceEngine]:
+    return CompiledEngine(MESH, law, integration, FIXED), ReferenceEngine(MESH, law, integration, FIXED)
 
 
 @pytest.mark.parametrize(("law", "integration", "damped"), list(product(LAWS, ("full", "selective"), (False, True))))
-def test_energy_gradient_and_tangent(law: str, integration: str, damped: bool, random: np.random.Generator) -> None:
+def test_compiled_and_reference_engines_agree(
+    law: str, integration: str, damped: bool, random: np.random.Generator
+) -> None:
     q = states(random)
     moduli = np.tile([7e4, 6e5, 0.0, 0.0, 0.0], (len(q), 1)) * np.linspace(0.5, 1.5, len(q))[:, None]
-    compiled, plain = engines(law, integration)
-    resistance = Resistance(moduli)
+    compiled, reference = engines(law, integration)
+    state = ConstitutiveState(moduli)
     if damped:
         moduli[:, 2:] = [20.0, 300.0, 900.0]
-        points = compiled.integration.points.volume.shape
+        points = compiled.quadrature.points.volume.shape
         strain = random.normal(0, 1.0, (len(q), *points, 6))
-        resistance = Resistance(moduli, random.normal(0, 0.3, q.shape), 100.0, strain, 120.0)
+        state = ConstitutiveState(moduli, random.normal(0, 0.3, q.shape), 100.0, strain, 120.0)
     x = random.normal(size=q.shape)
     for project in (False, True):
-        ours = compiled.terms(q, resistance, tangent=True, project=project)
-        theirs = plain.terms(q, resistance, tangent=True, project=project)
-        for mine, other in (
-            (ours[0], theirs[0]),
-            (ours[1], theirs[1]),
-            (compiled.multiply(ours[2], x), plain.multiply(theirs[2], x)),
+        compiled_values = compiled.evaluate(q, state, tangent=True, project=project)
+        reference_values = reference.evaluate(q, state, tangent=True, project=project)
+        for found, expected in (
+            (compiled_values[0], reference_values[0]),
+            (compiled_values[1], reference_values[1]),
+            (compiled.multiply(compiled_values[2], x), reference.multiply(reference_values[2], x)),
         ):
-            # The inside-out body's projected volume term is where rounding is largest.
-            assert np.abs(mine - other).max() < 1e-10 * np.abs(other).max()
+            # Rounding is largest in the projected volume term of the inverted body.
+            assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
 
 
-def test_gradient_is_the_slope_of_the_energy_and_tangent_that_of_the_gradient(random: np.random.Generator) -> None:
+def test_gradient_and_tangent_by_finite_differences(random: np.random.Generator) -> None:
     for law, integration in product(LAWS, ("full", "selective")):
-        engine = Compiled(MESH, law, integration, FIXED)
+        engine = CompiledEngine(MESH, law, integration, FIXED)
         q = states(random)[1:3]
-        points = engine.integration.points.volume.shape
-        past = (random.normal(0, 0.3, q.shape), 100.0, random.normal(0, 1.0, (2, *points, 6)), 120.0)
-        resistance = Resistance(np.tile([7e4, 6e5, 20.0, 300.0, 900.0], (2, 1)), *past)
+        points = engine.quadrature.points.volume.shape
+        damping = (random.normal(0, 0.3, q.shape), 100.0, random.normal(0, 1.0, (2, *points, 6)), 120.0)
+        state = ConstitutiveState(np.tile([7e4, 6e5, 20.0, 300.0, 900.0], (2, 1)), *damping)
         direction = random.normal(size=q.shape)
         h = 1e-8
-        up, down = (engine.terms(q + sign * h * direction, resistance, tangent=False) for sign in (1, -1))
-        _, gradient, tangents = engine.terms(q, resistance, tangent=True)
-        slope = (up[0] - down[0]) / (2 * h)
+        forward, backward = (engine.evaluate(q + sign * h * direction, state, tangent=False) for sign in (1, -1))
+        _, gradient, tangents = engine.evaluate(q, state, tangent=True)
+        slope = (forward[0] - backward[0]) / (2 * h)
         np.testing.assert_allclose((gradient * direction).sum((1, 2)), slope, rtol=1e-6)
-        bend = (up[1] - down[1]) / (2 * h)
-        product_ = engine.multiply(tangents, direction)
-        assert np.abs(product_ - bend).max() < 1e-6 * np.abs(bend).max()
+        gradient_slope = (forward[1] - backward[1]) / (2 * h)
+        tangent_product = engine.multiply(tangents, direction)
+        assert np.abs(tangent_product - gradient_slope).max() < 1e-6 * np.abs(gradient_slope).max()
 
 
 @pytest.mark.parametrize("integrator", ["implicit-euler", "generalised-alpha"])
-def test_both_simulate_and_differentiate_alike(integrator: str, random: np.random.Generator) -> None:
-    """Positions and gradients of a damped batch agree to 1e-10 of their size."""
+def test_trajectories_and_gradients_of_both_engines_agree(integrator: str, random: np.random.Generator) -> None:
+    """On a damped batch: positions to a relative 1e-10, gradients to a relative 1e-8."""
     material = Material(1.5e5, 0.45, mass="lumped", law="corotated", viscosity=20.0, stiffness_damping=2e-3)
     kick = torch.tensor(random.normal(0, 0.1, (2, *MESH.vertices.shape)))
     found = []
@@ -91,8 +93,8 @@ def test_both_simulate_and_differentiate_alike(integrator: str, random: np.rando
         positions, _ = rollout(simulator, start, 6, parameters=parameters)
         (positions[-1] ** 2).sum().backward()
         found.append((positions.detach(), q.grad, parameters.youngs_modulus))
-    (ours, by_q, _), (theirs, by_other, _) = found
+    (compiled, by_q, _), (reference, by_q_reference, _) = found
     assert by_q is not None
-    assert by_other is not None
-    assert float((ours - theirs).abs().max()) < 1e-10 * float(theirs.abs().max())
-    assert float((by_q - by_other).abs().max()) < 1e-8 * float(by_other.abs().max())
+    assert by_q_reference is not None
+    assert float((compiled - reference).abs().max()) < 1e-10 * float(reference.abs().max())
+    assert float((by_q - by_q_reference).abs().max()) < 1e-8 * float(by_q_reference.abs().max())

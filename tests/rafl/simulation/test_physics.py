@@ -1,4 +1,4 @@
-"""The simulator against solutions that are known exactly, and against another finite-element code."""
+"""Comparison of the simulator with exact solutions and with another finite-element code."""
 
 from dataclasses import replace
 
@@ -23,12 +23,12 @@ by_law = pytest.mark.parametrize("law", LAWS)
 
 def start_of(q: np.ndarray, v: np.ndarray | None = None) -> Start:
     positions = torch.from_numpy(q[None])
-    still = torch.zeros_like(positions)
-    return Start(positions, still if v is None else torch.from_numpy(v[None]), still, still[..., 0], ("body",))
+    zeros = torch.zeros_like(positions)
+    return Start(positions, zeros if v is None else torch.from_numpy(v[None]), zeros, zeros[..., 0], ("body",))
 
 
 def distorted(random: np.random.Generator) -> tuple[HexMesh, np.ndarray]:
-    """A box whose inner vertices are out of place, and its outer vertices."""
+    """A box with displaced inner vertices, and the indices of its outer vertices."""
     mesh = HexMesh.box((4, 3, 3), (0.04, 0.03, 0.03))
     outer = np.unique(mesh.surface)
     moved = mesh.vertices.copy()
@@ -40,7 +40,7 @@ def distorted(random: np.random.Generator) -> tuple[HexMesh, np.ndarray]:
 @by_law
 @pytest.mark.parametrize("integration", ["full", "selective"])
 def test_patch(law: str, integration: str, random: np.random.Generator) -> None:
-    """Boundary moved by an affine map F X + c: every inner vertex follows, whatever the cells' shapes."""
+    """The boundary moves by an affine map F X + c: every inner vertex follows, for any cell shapes."""
     mesh, outer = distorted(random)
     simulator = Simulator(mesh, Material(law=law, integration=integration), outer, gravity=NO_GRAVITY)
     F = Rotation.from_rotvec([0.3, -0.5, 0.2]).as_matrix() @ np.array(
@@ -55,28 +55,27 @@ def test_patch(law: str, integration: str, random: np.random.Generator) -> None:
 
 
 @by_law
-def test_rigid_motion(law: str, random: np.random.Generator) -> None:
-    """No force in any place and attitude; the forces of a strained body turn with it."""
+def test_forces_are_invariant_under_rigid_motion(law: str, random: np.random.Generator) -> None:
+    """Rigid motion of an unstrained body gives no force; the forces of a strained body rotate with it."""
     mesh, _ = distorted(random)
     simulator = Simulator(mesh, Material(law=law), FREE)
-    turn = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
-    moved = mesh.vertices @ turn.T + [0.1, -0.2, 0.3]
-    scale = 4e5 * 0.01**2  # the stress of unit strain on a cell's side [N]
+    rotation = Rotation.from_rotvec([0.4, -1.1, 2.0]).as_matrix()
+    moved = mesh.vertices @ rotation.T + [0.1, -0.2, 0.3]
+    scale = 4e5 * 0.01**2  # force of unit strain on the side of a cell [N]
     assert np.abs(simulator.elastic_gradient(moved[None])).max() < 1e-12 * scale
     q = mesh.vertices + random.normal(0, 1e-3, mesh.vertices.shape)
     gradient = simulator.elastic_gradient(q[None])
-    np.testing.assert_allclose(simulator.elastic_gradient((q @ turn.T)[None]), gradient @ turn.T, atol=1e-12 * scale)
-    # Internal forces push and turn nothing.
+    np.testing.assert_allclose(
+        simulator.elastic_gradient((q @ rotation.T)[None]), gradient @ rotation.T, atol=1e-12 * scale
+    )
+    # Internal forces have no resultant force or moment.
     np.testing.assert_allclose(gradient[0].sum(0), 0.0, atol=1e-12 * scale)
     np.testing.assert_allclose(np.cross(q, gradient[0]).sum(0), 0.0, atol=1e-13 * scale)
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("implicit-euler", 1), ("generalised-alpha", 2)])
 def test_momentum_of_a_free_body(integrator: str, order: int, random: np.random.Generator) -> None:
-    """Linear momentum is kept to the solver's tolerance.
-
-    What is lost of angular momentum falls with the step's order.
-    """
+    """Linear momentum is conserved to the solver tolerance, angular momentum to the order of the method."""
     mesh = HexMesh.box((4, 2, 2), (0.08, 0.03, 0.03))
     simulator = Simulator(
         mesh, Material(mass="lumped", law="corotated"), FREE, gravity=NO_GRAVITY, integrator=integrator
@@ -85,19 +84,19 @@ def test_momentum_of_a_free_body(integrator: str, order: int, random: np.random.
     spin = np.cross([3.0, -2.0, 4.0], mesh.vertices - mesh.vertices.mean(0))
     v = spin + [0.2, 0.1, -0.3] + 5.0 * (mesh.vertices - mesh.vertices.mean(0)) * [1.0, -0.5, -0.5]
 
-    def momenta(h: float) -> tuple[np.ndarray, np.ndarray]:
+    def final_momenta(h: float) -> tuple[np.ndarray, np.ndarray]:
         q, _ = rollout(replace(simulator, time_step=h), start_of(mesh.vertices, v), round(0.06 / h))
         last = torch.diff(q[-3:, 0], dim=0).numpy() / h
-        speed = 1.5 * last[1] - 0.5 * last[0]  # at the last frame, to second order
+        speed = 1.5 * last[1] - 0.5 * last[0]  # extrapolated to the last frame, second order
         return (mass * speed).sum(0), (mass * np.cross(q[-1, 0], speed)).sum(0)
 
-    before = (mass * v).sum(0), (mass * np.cross(mesh.vertices, v)).sum(0)
-    lost = []
+    initial = (mass * v).sum(0), (mass * np.cross(mesh.vertices, v)).sum(0)
+    loss = []
     for h in (2e-3, 1e-3):
-        linear, angular = momenta(h)
-        np.testing.assert_allclose(linear, before[0], atol=2e-8)
-        lost.append(np.abs(angular - before[1]).max())
-    assert lost[1] < 1.3 * lost[0] / 2**order
+        linear, angular = final_momenta(h)
+        np.testing.assert_allclose(linear, initial[0], atol=2e-8)
+        loss.append(np.abs(angular - initial[1]).max())
+    assert loss[1] < 1.3 * loss[0] / 2**order
 
 
 def test_free_fall_is_exact_for_implicit_euler() -> None:
@@ -121,18 +120,18 @@ def timoshenko(force: float, nu: float) -> float:
 
 
 def tip_deflection(cells: int, nu: float, law: str = "corotated", integration: str = "full") -> float:
-    """Of a square cantilever, `cells` across and five times as many along, as a share of Timoshenko's."""
+    """Tip deflection of a square cantilever, relative to Timoshenko's; `cells` across, five times as many along."""
     mesh = HexMesh.box((5 * cells, cells, cells), (LENGTH, SIDE, SIDE))
     material = Material(MODULUS, nu, law=law, integration=integration)
     simulator = Simulator(mesh, material, mesh.face_nodes("x-min"), gravity=NO_GRAVITY)
-    total = 1e-5  # small: rotations of 1e-5
+    total = 1e-5  # [N]; small, so that rotations are 1e-5
     q = simulator.equilibrium(total * face_load(mesh)[None])
     tip = mesh.face_nodes("x-max")
     return float((q[0] - mesh.vertices)[tip, 2].mean() / timoshenko(total, nu))
 
 
 def face_load(mesh: HexMesh) -> np.ndarray:
-    """A unit force along z spread evenly over the tip face (N, 3)."""
+    """Nodal forces (N, 3) of a unit force along z, distributed evenly over the tip face."""
     quads = mesh.face_quads("x-max")
     load = np.zeros_like(mesh.vertices)
     np.add.at(load[:, 2], np.ravel(quads), 1.0 / (4 * len(quads)))
@@ -141,11 +140,11 @@ def face_load(mesh: HexMesh) -> np.ndarray:
 
 @by_law
 def test_cantilever_converges_to_timoshenko(law: str) -> None:
-    """Within 3 % at 8 cells across; each halving of the cells gains at least 2.5 times less than the last.
+    """Within 3 % at 8 cells across; each refinement changes the result by at least 2.5 times less than the last.
 
-    The theory itself is about 1 % off: it lets the clamped section warp and bulge.
+    The theory itself has an error of about 1 %: it lets the clamped section warp and bulge.
 
-    The projective law's bulk term counts a third: its Poisson's ratio to first order is another.
+    The bulk term of the projective law is lambda / 3 to first order, so its Poisson's ratio differs.
     """
     nu = 0.3
     if law == "projective":
@@ -160,7 +159,7 @@ def test_cantilever_converges_to_timoshenko(law: str) -> None:
 
 
 def test_nearly_incompressible_bending_needs_selective_integration() -> None:
-    """nu = 0.499, two cells across: full integration locks at a fraction of the deflection."""
+    """nu = 0.499, two cells across: full integration locks at less than half of the deflection."""
     full = tip_deflection(2, 0.499)
     selective = tip_deflection(2, 0.499, integration="selective")
     assert full < 0.5
@@ -183,22 +182,22 @@ def skfem_tip_deflection(cells: int, nu: float, total: float) -> float:
         return total / SIDE**2 * v[2]
 
     face = basis.boundary(mesh.facets_satisfying(lambda x: np.isclose(x[0], LENGTH)))
-    held = basis.get_dofs(lambda x: np.isclose(x[0], 0.0))
-    u = skfem.solve(*skfem.condense(stiffness.assemble(basis), load.assemble(face), D=held))
+    fixed = basis.get_dofs(lambda x: np.isclose(x[0], 0.0))
+    u = skfem.solve(*skfem.condense(stiffness.assemble(basis), load.assemble(face), D=fixed))
     tip = np.isclose(mesh.p[0], LENGTH)
     return float(u[basis.nodal_dofs[2, tip]].mean())
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.45])
-def test_same_mesh_same_deflection_as_scikit_fem(nu: float) -> None:
-    """Linear elasticity with eight points a cell, by another code: equal to what rotations of 1e-5 allow."""
+def test_deflection_equals_that_of_scikit_fem(nu: float) -> None:
+    """Linear elasticity on the same mesh with eight points per cell; rotations of 1e-5 limit the agreement."""
     theirs = skfem_tip_deflection(3, nu, 1e-5) / timoshenko(1e-5, nu)
     for law in ("corotated", "neo-hookean"):
         assert tip_deflection(3, nu, law) == pytest.approx(theirs, rel=2e-5)
 
 
 def test_order_in_space() -> None:
-    """Manufactured u = a sin(pi x) sin(pi y) sin(pi z) (1, 1, 1) in a unit cube: the error falls as h^2."""
+    """Manufactured solution u = a sin(pi x) sin(pi y) sin(pi z) (1, 1, 1) in a unit cube: the error falls as h^2."""
     mu, lam, size = 1.0, 1.5, 1e-6
 
     def body_force(x: np.ndarray) -> np.ndarray:
@@ -221,18 +220,18 @@ def test_order_in_space() -> None:
         share = np.einsum("gn,egi,eg->eni", rule.shape, body_force(points), rule.volume)
         force = np.zeros_like(mesh.vertices)
         np.add.at(force, mesh.hexes, share)
-        # Forces of 1e-6 N against a tolerance of 1e-10: the unit of force is a million times larger.
+        # The solver tolerance of 1e-10 N is too coarse for forces of 1e-6 N, so forces and stiffness are scaled by 1e6.
         stiff = Simulator(mesh, Material(1e6 * e, nu, law="corotated"), simulator.fixed, gravity=NO_GRAVITY)
         moved = stiff.equilibrium(1e6 * force[None])[0] - mesh.vertices
         exact = size * np.sin(np.pi * points).prod(-1, keepdims=True)
-        gap = np.einsum("gn,eni->egi", rule.shape, moved[mesh.hexes]) - exact
-        errors.append(np.sqrt((rule.volume[..., None] * gap**2).sum()))
+        error = np.einsum("gn,eni->egi", rule.shape, moved[mesh.hexes]) - exact
+        errors.append(np.sqrt((rule.volume[..., None] * error**2).sum()))
     rates = np.log2(np.divide(errors[:-1], errors[1:]))
     np.testing.assert_allclose(rates, 2.0, atol=0.2)
 
 
-def swing(material: Material, integrator: str, h: float, steps: int, cells: int = 2) -> np.ndarray:
-    """Height of the tip of a slender beam let go from a slight bend [m], (T)."""
+def tip_height(material: Material, integrator: str, h: float, steps: int, cells: int = 2) -> np.ndarray:
+    """Height of the tip [m], (T), of a slender beam released from a slight bend."""
     mesh = HexMesh.box((10 * cells, cells, cells), (0.1, 0.01, 0.01))
     simulator = Simulator(
         mesh, material, mesh.face_nodes("x-min"), time_step=h, gravity=NO_GRAVITY, integrator=integrator
@@ -248,16 +247,16 @@ SLENDER = Material(4e6, 0.3, mass="lumped", law="corotated", integration="select
 
 
 def test_first_bending_frequency() -> None:
-    """Euler and Bernoulli's 1.8751^2 / (2 pi) sqrt(E I / (rho A L^4)); shear and rotary inertia take 1 %."""
+    """Euler-Bernoulli: 1.8751^2 / (2 pi) sqrt(E I / (rho A L^4)); shear and rotary inertia lower it by 1 %."""
     theory = 1.8751**2 / (2 * np.pi) * np.sqrt(4e6 * 0.01**2 / 12 / (1070 * 0.1**4))
-    z = swing(SLENDER, "generalised-alpha", 2e-3, 250, cells=4)
+    z = tip_height(SLENDER, "generalised-alpha", 2e-3, 250, cells=4)
     assert zero_crossing_frequency(z, 2e-3) == pytest.approx(0.99 * theory, rel=0.02)
 
 
 @pytest.mark.parametrize(("integrator", "order"), [("implicit-euler", 1), ("generalised-alpha", 2)])
 @by_law
 def test_order_in_time_of_a_swinging_beam(integrator: str, order: int, law: str) -> None:
-    """Root mean square error of a beam kicked in its first mode, against steps far smaller."""
+    """RMS error of a beam with initial velocity in its first mode, relative to a solution with far smaller steps."""
     mesh = HexMesh.box((20, 2, 2), (0.1, 0.01, 0.01))
     x = mesh.vertices[:, 0] / 0.1
     v = np.zeros_like(mesh.vertices)
@@ -277,27 +276,27 @@ def test_order_in_time_of_a_swinging_beam(integrator: str, order: int, law: str)
 
 @pytest.mark.parametrize("kind", ["mass_damping", "stiffness_damping", "viscosity"])
 def test_damping_ratio_of_the_first_mode(kind: str) -> None:
-    """Rayleigh: alpha / (2 w) and beta w / 2 of critical; viscosity: its stress beside Young's, times w / 2."""
+    """Rayleigh damping: alpha / (2 w) and beta w / 2; viscosity: w / 2 times the ratio of viscous modulus to E."""
     h = 2e-3
-    free = swing(SLENDER, "generalised-alpha", h, 600)
+    free = tip_height(SLENDER, "generalised-alpha", h, 600)
     w = 2 * np.pi * zero_crossing_frequency(free, h)
     value = {"mass_damping": 4.0, "stiffness_damping": 1e-3, "viscosity": 2000.0}[kind]
     mu = SLENDER.lame[0]
-    # In bending strains are (1, -nu, -nu): viscosity does 2 eta (1 + 2 nu^2) where elasticity does E.
+    # Bending strains are (1, -nu, -nu): the viscous modulus is 2 eta (1 + 2 nu^2), the elastic one E.
     expected = {
         "mass_damping": value / (2 * w),
         "stiffness_damping": value * w / 2,
         "viscosity": w * 2 * value * (1 + 2 * 0.3**2) / (2 * 2 * mu * 1.3),
     }[kind]
-    z = swing(replace(SLENDER, **{kind: value}), "generalised-alpha", h, 600)
+    z = tip_height(replace(SLENDER, **{kind: value}), "generalised-alpha", h, 600)
     inner = z[1:-1]
     peaks = inner[(inner < z[:-2]) & (inner <= z[2:])] if z[0] < 0 else inner[(inner > z[:-2]) & (inner >= z[2:])]
     found = np.log(peaks[0] / peaks[5]) / (2 * np.pi * 5)
     assert found == pytest.approx(expected, rel=0.1)
 
 
-def test_viscosity_does_not_brake_rigid_turning() -> None:
-    """A free body spinning at 3 rad/s keeps its energy under viscosity; stiffness damping is not so innocent."""
+def test_viscosity_does_not_damp_rigid_rotation() -> None:
+    """A free body spinning at 3 rad/s keeps its energy under viscosity, but loses it under stiffness damping."""
     mesh = HexMesh.box((3, 2, 2), (0.04, 0.03, 0.03))
     v = np.cross([0.0, 0.0, 3.0], mesh.vertices - mesh.vertices.mean(0))
     energies = {}

@@ -8,7 +8,7 @@ from rafl.common.errors import SimulationError
 from rafl.fem.laws import LAWS
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
-from rafl.simulation.rollout import FIRST_SHARE, Start, _Body, equilibrium, rollout
+from rafl.simulation.rollout import FIRST_ACCELERATION_FRACTION, Start, _BodyBatch, equilibrium, rollout
 from rafl.simulation.simulator import Simulator
 from rafl.simulation.time_integration import INTEGRATORS as INTEGRATOR_OF
 from rafl.simulation.time_integration import Integrator, State
@@ -24,15 +24,15 @@ def simulator_of(integrator: str = "implicit-euler", **values: object) -> Simula
 
 
 def start_of(q: Tensor, v: Tensor | None = None, force: Tensor | None = None) -> Start:
-    none = torch.zeros_like(q)
+    zeros = torch.zeros_like(q)
     names = tuple("abcdefghi")[: len(q)]
-    return Start(q, none if v is None else v, none if force is None else force, none[..., 0], names)
+    return Start(q, zeros if v is None else v, zeros if force is None else force, zeros[..., 0], names)
 
 
 def state(name: str, random: np.random.Generator) -> np.ndarray:
-    """(2, N, 3)"""
+    """Positions of one of the named states, (2, N, 3) [m]."""
     q = np.stack([MESH.vertices, MESH.vertices])
-    if name == "repeated stretches":  # the same stretch across, everywhere
+    if name == "repeated stretches":  # equal lateral stretches at every point
         return q * [1.1, 0.95, 0.95]
     if name == "shaken":
         return q + random.normal(0, 1e-3, q.shape)
@@ -43,7 +43,7 @@ def state(name: str, random: np.random.Generator) -> np.ndarray:
     return q
 
 
-# What each input is multiplied by, so that a change of 1e-6 is well above the solver's tolerance.
+# Factor of each input, chosen so that a change of 1e-6 is well above the solver tolerance.
 SCALE = {
     "q": 1e-2,
     "v": 1.0,
@@ -95,7 +95,7 @@ def simulate(simulator: Simulator, scaled: dict[str, Tensor], steps: int) -> Ten
     ],
 )
 def test_gradients(name: str, integrator: str, law: str, damped: bool, random: np.random.Generator) -> None:
-    """By everything: initial state, forces, masses, material, gravity, damping and the clamp's motion."""
+    """With respect to initial state, forces, masses, material, gravity, damping and motion of the clamp."""
     steps = 2
     simulator = simulator_of(integrator, law=law)
     scaled = inputs(state(name, random), damped, random, steps)
@@ -110,21 +110,21 @@ def test_gradients(name: str, integrator: str, law: str, damped: bool, random: n
 
 
 @pytest.mark.parametrize("law", LAWS)
-def test_gradients_through_the_equilibrium(law: str, random: np.random.Generator) -> None:
+def test_gradients_of_the_equilibrium(law: str, random: np.random.Generator) -> None:
     simulator = simulator_of(law=law)
     force = torch.tensor(random.normal(0, 0.2, (2, len(MESH.vertices), 3)))
     modulus = torch.tensor([10.0, 12.0], dtype=torch.float64)
     ratio, density, gravity = (torch.tensor(x, dtype=torch.float64) for x in (4.0, 1.07, [0.1, 0.2, -0.98]))
-    held = torch.tensor(MESH.vertices[FIXED] / SCALE["clamp"]).repeat(2, 1, 1)
+    fixed = torch.tensor(MESH.vertices[FIXED] / SCALE["clamp"]).repeat(2, 1, 1)
     weights = torch.tensor(random.normal(size=force.shape))
 
-    def loss(force: Tensor, e: Tensor, nu: Tensor, rho: Tensor, gravity: Tensor, held: Tensor) -> Tensor:
+    def loss(force: Tensor, e: Tensor, nu: Tensor, rho: Tensor, gravity: Tensor, fixed: Tensor) -> Tensor:
         own = {"youngs_modulus": e, "poissons_ratio": nu, "density": rho, "gravity": gravity}
         parameters = simulator.parameters(**{key: SCALE[key] * value for key, value in own.items()})
-        q = equilibrium(simulator, SCALE["force"] * force, parameters, SCALE["clamp"] * held)
+        q = equilibrium(simulator, SCALE["force"] * force, parameters, SCALE["clamp"] * fixed)
         return 100.0 * (weights * q).sum()
 
-    leaves = [x.requires_grad_() for x in (force, modulus, ratio, density, gravity, held)]
+    leaves = [x.requires_grad_() for x in (force, modulus, ratio, density, gravity, fixed)]
     assert torch.autograd.gradcheck(loss, leaves, eps=1e-6, atol=1e-4, rtol=1e-4, fast_mode=True)
 
 
@@ -132,8 +132,8 @@ def test_gradients_through_the_equilibrium(law: str, random: np.random.Generator
 def test_the_adjoint_is_the_transpose_of_the_derivative(integrator: str, random: np.random.Generator) -> None:
     """Dot-product test <w, J d> = <J^T w, d> to 1e-9 over five steps.
 
-    J d is carried forward here: linear steps of the perturbation with the same tangents, through the
-    integrator's own formulas, which are linear in the state.
+    J d is computed in forward mode: the perturbation takes linear steps with the same tangents. The formulas of the
+    integrators are linear in the state, so they also hold for the perturbation.
     """
     steps = 5
     simulator = simulator_of(integrator)
@@ -145,47 +145,49 @@ def test_the_adjoint_is_the_transpose_of_the_derivative(integrator: str, random:
     gradients = torch.autograd.grad(positions, leaves, weights)
     transposed = sum(float((g * x).sum()) for g, x in zip(gradients, (dq, dv, df), strict=True))
 
-    engine, resistance, stepping = simulator.engine, simulator.resistance(2), INTEGRATOR_OF[integrator]
-    mass, none = torch.from_numpy(simulator.node_mass).expand(2, -1), torch.zeros(2, 1, dtype=torch.float64)
-    free, held = engine.free_index, torch.from_numpy(FIXED)
+    engine, constitutive, method = simulator.engine, simulator.constitutive_state(2), INTEGRATOR_OF[integrator]
+    mass, zeros = torch.from_numpy(simulator.node_mass).expand(2, -1), torch.zeros(2, 1, dtype=torch.float64)
+    free, fixed = engine.free_index, torch.from_numpy(FIXED)
 
     def tangents(x: Tensor) -> np.ndarray:
-        return engine.terms(x.detach().numpy(), resistance, tangent=True)[2]
+        return engine.evaluate(x.detach().numpy(), constitutive, tangent=True)[2]
 
-    def solved(stepping: Integrator, change: State, x: Tensor, h: float) -> Tensor:
-        """The change of a step's solution x by that of the state before it."""
-        problem = stepping.problem(change, mass, none, h)
-        moved = torch.zeros_like(dq)
-        moved[:, held] = change.q[:, held]
-        pulled = torch.from_numpy(engine.multiply(tangents(x), moved.numpy()))
-        right = (problem.inertia[..., None] * problem.target + df - pulled).numpy().reshape(2, -1)[:, free]
+    def solution_change(method: Integrator, change: State, x: Tensor, h: float) -> Tensor:
+        """Change of the solution x of a step due to a change of the state before it."""
+        problem = method.problem(change, mass, zeros, h)
+        change_of_x = torch.zeros_like(dq)
+        change_of_x[:, fixed] = change.q[:, fixed]
+        fixed_force = torch.from_numpy(engine.multiply(tangents(x), change_of_x.numpy()))
+        right = (problem.inertia[..., None] * problem.target + df - fixed_force).numpy().reshape(2, -1)[:, free]
         diagonal = np.repeat(problem.inertia.numpy(), 3, axis=1)[:, free]
-        flat = moved.reshape(2, -1)
+        flat = change_of_x.reshape(2, -1)
         flat[:, free] = torch.from_numpy(engine.solve_once(tangents(x), diagonal, right[:, None])[:, 0])
         return flat.reshape(dq.shape)
 
     total, h = float((weights[0] * dq).sum()), simulator.time_step
     change = State(dq, dv, torch.zeros_like(dq))
-    if stepping.uses_acceleration:
-        short, body = FIRST_SHARE * h, _Body.of(simulator, None, none.expand(2, 12))
-        first = body.acceleration(State(q, v, torch.zeros_like(q)), force + body.weight, none, q[:, held], short)
-        first[:, held] = -v[:, held] / short
-        x = solved(INTEGRATOR_OF["implicit-euler"], change, q + short * v + short**2 * first, short)
+    if method.uses_acceleration:
+        short, body = FIRST_ACCELERATION_FRACTION * h, _BodyBatch.of(simulator, None, zeros.expand(2, 12))
+        first = body.initial_acceleration(
+            State(q, v, torch.zeros_like(q)), force + body.weight, zeros, q[:, fixed], short
+        )
+        first[:, fixed] = -v[:, fixed] / short
+        x = solution_change(INTEGRATOR_OF["implicit-euler"], change, q + short * v + short**2 * first, short)
         start = ((x - dq) / short - dv) / short
-        start[:, held] = 0.0
+        start[:, fixed] = 0.0
         change = State(dq, dv, start)
     before = positions[0]
     for step in range(steps):
         after = positions[step + 1]
-        x = before + stepping.fraction * (after - before)  # where the step's equation holds
-        change = stepping.advance(change, solved(stepping, change, x, h), h)
+        x = before + method.fraction * (after - before)  # where the equation of the step holds
+        change = method.advance(change, solution_change(method, change, x, h), h)
         total += float((weights[step + 1] * change.q).sum())
         before = after
     assert total == pytest.approx(transposed, rel=1e-9)
 
 
-def test_the_residual_force_acts_at_the_start_of_each_step() -> None:
-    """Eq. (2): adding f to the external force or returning it as residual is the same thing."""
+def test_residual_force_acts_like_an_external_force() -> None:
+    """Paper, eq. 2: a constant force has the same effect as external force and as residual."""
     simulator = simulator_of()
     q = torch.tensor(MESH.vertices[None])
     extra = 0.01 * torch.ones_like(q)
@@ -196,16 +198,16 @@ def test_the_residual_force_acts_at_the_start_of_each_step() -> None:
         return extra
 
     by_hook, forces = rollout(simulator, start_of(q), 4, residual)
-    by_load, none = rollout(simulator, start_of(q, force=extra), 4)
+    by_load, no_forces = rollout(simulator, start_of(q, force=extra), 4)
     torch.testing.assert_close(by_hook, by_load, atol=1e-12, rtol=0)
     torch.testing.assert_close(seen[0][0], torch.from_numpy(simulator.weight))
     assert forces.shape == (4, *q.shape)
-    assert none.numel() == 0
+    assert no_forces.numel() == 0
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)
-def test_the_clamp_carries_the_body_along(integrator: str) -> None:
-    """A clamp moved at a constant speed with everything on it: no strain, whatever the speed."""
+def test_uniformly_moving_clamp_causes_no_strain(integrator: str) -> None:
+    """Clamp and body move at the same constant velocity."""
     simulator = Simulator(MESH, Material(), FIXED, gravity=(0.0, 0.0, 0.0), integrator=integrator)
     q = torch.tensor(MESH.vertices[None])
     speed = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
@@ -216,7 +218,7 @@ def test_the_clamp_carries_the_body_along(integrator: str) -> None:
 
 
 @pytest.mark.parametrize("substeps", [1, 4])
-def test_substeps_are_smaller_steps(substeps: int) -> None:
+def test_substeps_equal_smaller_time_steps(substeps: int) -> None:
     q = torch.tensor(MESH.vertices[None])
     material = Material(mass="lumped")
     coarse = Simulator(MESH, material, FIXED, 0.01, substeps=substeps)
@@ -226,7 +228,7 @@ def test_substeps_are_smaller_steps(substeps: int) -> None:
     torch.testing.assert_close(positions, every[::substeps], atol=1e-11, rtol=0)
 
 
-def test_a_failed_step_names_trajectory_and_step() -> None:
+def test_failed_step_names_trajectory_and_step() -> None:
     simulator = simulator_of()
     q = torch.tensor(MESH.vertices[None])
     calls = []
@@ -239,8 +241,8 @@ def test_a_failed_step_names_trajectory_and_step() -> None:
         rollout(simulator, start_of(q), 5, bad)
 
 
-def test_a_body_let_go_at_one_node_swings_by_either_integrator() -> None:
-    """Its force jumps there; the exact first acceleration made generalised-alpha fail in the fourth step."""
+def test_both_integrators_simulate_a_body_released_at_one_node() -> None:
+    """The force jumps at that node; with the exact initial acceleration generalised-alpha failed in the fourth step."""
     mesh = HexMesh.box((6, 2, 2), (0.06, 0.02, 0.02))
     material = Material(1.5e5, 0.49, mass="lumped", law="corotated", viscosity=300.0)
     tip = mesh.face_nodes("x-max")
