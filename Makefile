@@ -1,13 +1,14 @@
-# `make demo` and `make test` are all a fresh machine needs; both set up .venv first.
+# A fresh machine needs two commands, `make demo` and `make test`. Both set up .venv first.
 VENV := .venv
 BIN := $(VENV)/bin
 DEMO := build/demo
 SHARED ?= ../shared
 TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
-# BLAS threads fight the simulator's own.
+# BLAS threads would compete with the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test lint real real-beam real-presets check-reference bench-simulator bench-tracking bench-paper bench-capture bench-sim2real clean
+.PHONY: install demo test lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
+	bench-simulator bench-tracking bench-paper bench-capture bench-sim2real clean
 
 install: $(VENV)/installed $(VENV)/kernels
 
@@ -16,12 +17,12 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	touch $@
 
-# A compiled kernel that is kept does not know that one which it calls has changed in another file.
+# numba does not notice that a kernel has changed in another file than its caller's, so all are compiled again.
 $(VENV)/kernels: $(VENV)/installed $(shell find calibration capture rafl tracking -name "*.py")
 	find capture calibration rafl tracking -name '*.nb[ci]' -delete
 	touch $@
 
-# From a simulated specimen on film to a fitted model, by the commands a lab types.
+# From rendered videos of a simulated specimen to a fitted model, by the commands that a laboratory types.
 demo: install
 	rm -rf $(DEMO)
 	$(BIN)/rafl-render datasets/specimens/canonical.yaml --out $(DEMO) --frames 80
@@ -31,48 +32,72 @@ demo: install
 	$(BIN)/rafl-fit $(DEMO)/canonical.h5 --out $(DEMO)/run --epochs 16
 	$(BIN)/rafl-eval $(DEMO)/run $(DEMO)/canonical.h5
 
-# Two workers of one thread each: kernels of several threads in each would fight over the cores.
-test: install lint
+# Two workers of one thread each: kernels with several threads in each would compete for the cores.
+test: install lint docs
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
-lint: install
+# Type checkers look for rafl.tracking in the folder rafl; these links put it there.
+build/types: $(VENV)/installed $(wildcard rafl/*)
+	rm -rf $@ && mkdir -p $@/rafl
+	ln -s $(addprefix $(CURDIR)/,$(wildcard rafl/*) calibration capture datasets tracking) $@/rafl/
+
+lint: install build/types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-# What needs the recordings and trajectories beside the checkout; skipped where they are absent.
+# The documentation site, in build/site; a broken link or reference is an error.
+docs: install build/types
+	$(BIN)/mkdocs build --quiet
+
+# The pictures of the site's gallery, from the demonstration's output.
+gallery: demo
+	$(BIN)/python docs/gallery.py $(DEMO)
+
+# The package for other people's environments, in dist/.
+wheel: install
+	rm -rf dist build/lib build/bdist.*
+	$(BIN)/pip wheel --quiet --no-deps --wheel-dir dist .
+
+# The wheel beside Hugging Face's package `datasets`, in an environment of its own.
+check-wheel: wheel
+	rm -rf build/wheel && python3 -m venv build/wheel
+	build/wheel/bin/pip install --quiet --constraint constraints.txt dist/rafl-*.whl datasets
+	cd build && wheel/bin/python ../tests/check_wheel.py
+
+# Tests that need the recordings and reference trajectories beside the checkout; skipped if they are absent.
 real: install
 	SHARED=$(SHARED) $(BIN)/pytest -m "real or reference" -rs
 
-# The real beam, each recording held out in turn: original, SysID, RAFL.
+# The real beam with each recording held out in turn: baseline, system identification, RAFL.
 real-beam: install
 	$(BIN)/python tests/bench/clamped_beam.py $(SHARED)/real/clamped_beam --out build/clamped_beam
 
-# Presets of the untouched simulator beside the real beam, before and after identifying its material.
+# The presets of the baseline simulator compared with the real beam, before and after identifying its material.
 real-presets: install
 	$(BIN)/python tests/bench/presets.py $(SHARED)/real/clamped_beam --out build/presets
 
-# Trajectories and gradients of the paper's own simulator, every file in a folder: make check-reference DIR=...
+# Our trajectories and gradients compared with those of the paper's simulator, all files of a folder (DIR=folder).
 check-reference: install
 	$(BIN)/python tests/reference/check.py $(or $(DIR),$(SHARED)/reference)
 
-# Speed of forward and backward steps beside the authors', and how it grows with mesh, batch and threads.
+# Time of forward and backward steps compared with the authors', and its growth with mesh, batch and threads.
 bench-simulator: install
 	$(BIN)/python tests/bench/simulator.py $(SHARED)/reference
 
-# Tracking and calibration on footage made fresh (SEED=number for the same again), beside trackpy and OpenCV.
+# Tracking and calibration on freshly rendered videos (SEED=number repeats one), compared with trackpy and OpenCV.
 bench-tracking: install
 	$(BIN)/python tests/bench/tracker.py $(if $(SEED),--seed $(SEED)) $(if $(wildcard $(SHARED)/real/clamped_beam),--real $(SHARED)/real/clamped_beam)
 
-# The paper's sim-to-sim studies, hours: make bench-paper; QUICK=1 for a short form. Resumable.
+# The paper's sim-to-sim studies. They take hours and can be resumed; QUICK=1 runs a short form.
 bench-paper: install
 	$(BIN)/python tests/bench/paper.py $(if $(QUICK),--quick,--results datasets/results) $(if $(wildcard $(TAIL)),--tail-cells $(TAIL))
 
-# The sim-to-real study with a stricter simulator as the lab, hours: make bench-sim2real; QUICK=1 for a short form.
+# The sim-to-real study with a stricter simulator as the laboratory. As long; QUICK=1 runs a short form.
 bench-sim2real: install
 	$(BIN)/python tests/bench/sim2real.py $(if $(QUICK),--quick,--results datasets/results)
 
-# The first frame: the direct fit beside the sequence of forces of earlier work.
+# The direct fit of the first frame compared with the sequence of forces of earlier work.
 bench-capture: install
 	$(BIN)/python tests/bench/first_frame.py
 

@@ -1,4 +1,4 @@
-"""Make the pictures of the gallery from the reports and the model of the demonstration: python docs/gallery.py build/demo."""
+"""Make the pictures of the gallery from the output of the demonstration: python docs/gallery.py build/demo."""
 
 import base64
 import io

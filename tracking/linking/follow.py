@@ -1,4 +1,4 @@
-"""Following every dot of a recording through one camera's video."""
+"""Tracking all markers of a recording through one camera's video."""
 
 import heapq
 from collections.abc import Callable
@@ -9,193 +9,199 @@ from typing import Any
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rafl.tracking.detection.appearance import find_family
-from rafl.tracking.detection.detect import Dots, eight_bits
-from rafl.tracking.linking.late_markers import Newcomer
-from rafl.tracking.linking.shape_prior import Memory
-from rafl.tracking.linking.tracker import FEW_SHAPES, Tracker
-from rafl.tracking.reconstruction.uncertainty import places_and_errors, share_of_noise
+
+from rafl.common.errors import InputError
+from rafl.tracking.detection.appearance import find_markers
+from rafl.tracking.detection.detect import Dots, to_eight_bits
+from rafl.tracking.linking.late_markers import LateMarker
+from rafl.tracking.linking.shape_prior import ShapePrior
+from rafl.tracking.linking.tracker import MIN_SHAPES, Tracker
+from rafl.tracking.reconstruction.uncertainty import filtered_positions, noise_fraction
 from rafl.tracking.video.frame import Frame
 from rafl.tracking.video.reader import Video
 
-from rafl.common.errors import InputError
-
 Array = NDArray[Any]
 
-FEWEST_MARKERS = 3
-WORST = 10  # frames whose pictures are kept
-NOTHING = np.empty((0, 2))
+MIN_MARKERS = 3
+WORST_FRAME_COUNT = 10  # frames whose images are kept for the report
+NO_POSITIONS = np.empty((0, 2))
 
 
 @dataclass(frozen=True)
 class PixelTracks:
-    """One camera's view of a recording; markers not named yet.
+    """One camera's view of a recording, before the markers get their names.
 
     Attributes:
-        time: [s], (T), NaN where the video does not say.
-        pixel: (T, D, 2), NaN where not measured; where the coding is known, as the others' motion mends it.
+        time: [s], (T), NaN where the video gives none.
+        pixel: positions [px], (T, D, 2), NaN where not measured. If the quantisation step is known, they are corrected
+            by the other markers' motion.
         sigma: one standard deviation along x and y [px], (T, D, 2).
-        start: positions in the first frame that shows markers [px], (D, 2); of late ones where the others put them.
-        late: how many markers, the last ones, came into sight later.
+        start: positions in the first frame that shows markers [px], (D, 2); predicted for late-detected markers.
+        late_count: number of late-detected markers, which are the last ones.
         damaged: frames that could not be decoded, (T).
-        pictures: the first frame and the worst ten, by number, as JPEG.
-        notes: what the video said that contradicts itself.
+        images: the first frame and the ten worst ones as JPEG, by frame number.
+        notes: contradictions in the video's own statements.
     """
 
     time: Array
     pixel: Array
     sigma: Array
     start: Array
-    late: int
+    late_count: int
     damaged: NDArray[np.bool_]
-    pictures: dict[int, bytes]
+    images: dict[int, bytes]
     notes: tuple[str, ...]
 
 
 def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
-    """Find the markers in the first frame that shows some and follow them, and those that come later, to the last.
+    """Find the markers in the first frame that shows some, and track them and late-detected ones to the last frame.
 
     Args:
-        video: one camera's.
+        video: of one camera.
         tick: called after every frame.
 
     Raises:
         InputError: fewer than three markers, or a video that cannot be decoded.
     """
     times: list[float] = []
-    seen: list[Sight] = []  # of as many markers as were known then
-    late: list[Newcomer] = []
+    detections: list[Detections] = []  # of the markers known at that frame
+    late: list[LateMarker] = []
     damaged: list[bool] = []
-    most = 0
+    max_dots = 0
     noise = 1.0
     tracker: Tracker | None = None
-    album = _Album()
+    worst_frames = _WorstFrames()
     reading = video.read()
     for frame in reading:
         times.append(frame.time)
         damaged.append(frame.picture is None)
-        sight = Sight(NOTHING, NOTHING, NOTHING, NOTHING[:, 0], frame.lag)
+        detected = Detections(NO_POSITIONS, NO_POSITIONS, NO_POSITIONS, NO_POSITIONS[:, 0], frame.lag)
         if frame.picture is not None and tracker is None:
-            found = find_family(frame.picture)
-            most = max(most, 0 if found is None else len(found[1]))
-            if found is not None and len(found[1]) >= FEWEST_MARKERS:
+            found = find_markers(frame.picture)
+            max_dots = max(max_dots, 0 if found is None else len(found[1]))
+            if found is not None and len(found[1]) >= MIN_MARKERS:
                 tracker = Tracker(*found)
-                noise = share_of_noise(found[1].grain, found[1].residual)
-                sight = Sight.of(tracker.looks.judge(frame.picture, found[1]), frame)
+                noise = noise_fraction(found[1].uncorrelated_residual, found[1].residual)
+                detected = Detections.of(tracker.complete_views.correct(frame.picture, found[1]), frame)
         elif frame.picture is not None and tracker is not None:
-            sight = Sight.of(tracker.advance(frame.picture), frame)
-            late += tracker.look_out(len(times) - 1, frame.picture)
+            detected = Detections.of(tracker.advance(frame.picture), frame)
+            late += tracker.add_late_markers(len(times) - 1, frame.picture)
         elif tracker is not None:
-            tracker.pass_over()
+            tracker.skip_frame()
         if frame.picture is not None and tracker is not None:
-            album.consider(len(times) - 1, frame.picture, sight.sigma)
-        seen.append(sight)
+            worst_frames.consider(len(times) - 1, frame.picture, detected.sigma)
+        detections.append(detected)
         tick()
     if all(damaged):
         raise InputError(f"expected frames in {video.path}, found none that decode; copy it again from the camera")
     if tracker is None:
         raise InputError(
-            f"{video.path}: expected at least {FEWEST_MARKERS} dots of one size in a frame, found {most} at most; "
+            f"{video.path}: expected at least {MIN_MARKERS} dots of one size in a frame, found {max_dots} at most; "
             "check that dots of 3 to 32 px radius contrast with the skin"
         )
-    with ThreadPoolExecutor(1) as aside:
-        pictures = aside.submit(album.pictures)
-        paths, sigma = places_and_errors(*_whole(seen, late, len(tracker.pattern.rest)), noise)
+    with ThreadPoolExecutor(1) as background:
+        images = background.submit(worst_frames.encode)
+        pixel, sigma = filtered_positions(*_assemble(detections, late, len(tracker.pattern.rest)), noise)
     start = tracker.pattern.rest
     if late:
-        start = _with_late_ones(start, paths, np.arange(len(start)) >= len(start) - len(late), tracker.marks.known)
+        is_late = np.arange(len(start)) >= len(start) - len(late)
+        start = _predict_late_starts(start, pixel, is_late, tracker.static_dots.mask)
     return PixelTracks(
-        np.array(times), paths, sigma, start, len(late), np.array(damaged), pictures.result(), tuple(reading.notes)
+        np.array(times), pixel, sigma, start, len(late), np.array(damaged), images.result(), tuple(reading.notes)
     )
 
 
 @dataclass(frozen=True)
-class Sight:
-    """The markers in one picture.
+class Detections:
+    """The markers in one frame.
 
     Attributes:
-        pixel: (D, 2), NaN where not seen.
-        sigma: from the fits [px], (D, 2), NaN where not seen.
-        leverage: what a grey level of independent noise in every pixel moves the centre by [px], (D, 2).
-        step: by which the video's coding rounded the picture there [grey levels], (D), NaN where not known.
-        lag: see `Frame`.
+        pixel: positions [px], (D, 2), NaN where not visible.
+        sigma: from the fits [px], (D, 2), NaN where not visible.
+        noise_gain: see `Dots`, (D, 2).
+        step: quantisation step at the marker [grey levels], (D), NaN where not known.
+        lag_factor: see `Frame`.
     """
 
     pixel: Array
     sigma: Array
-    leverage: Array
+    noise_gain: Array
     step: Array
-    lag: float
+    lag_factor: float
 
     @classmethod
-    def of(cls, dots: Dots, frame: Frame) -> "Sight":
-        """Those of a frame; dots without a sigma are not seen."""
+    def of(cls, dots: Dots, frame: Frame) -> "Detections":
+        """From the dots of a frame; those without a sigma are not visible."""
         pixel = np.where(np.isfinite(dots.sigma), dots.centre, np.nan)
-        return cls(pixel, dots.sigma, dots.leverage, frame.step_at(pixel), frame.lag)
+        return cls(pixel, dots.sigma, dots.noise_gain, frame.step_at(pixel), frame.lag)
 
 
-def _whole(seen: list[Sight], late: list[Newcomer], count: int) -> tuple[Array, Array, Array, Array, Array]:
-    """Pixels, sigma, leverage (T, D, 2) and steps (T, D) of all markers, NaN where not seen, and what `lag` is (T).
+def _assemble(
+    detections: list[Detections], late: list[LateMarker], count: int
+) -> tuple[Array, Array, Array, Array, Array]:
+    """The first arguments of `filtered_positions`, for all `count` markers; the late-detected ones are the last.
 
-    The last markers come late.
+    Returns:
+        Positions, sigma and noise gain, (T, D, 2), quantisation steps, (T, D), and lag factors, (T). All but the last
+        are NaN where not measured.
     """
-    paths, fitted, leverage = np.full((3, len(seen), count, 2), np.nan)
-    step = np.full((len(seen), count), np.nan)
-    for frame, sight in enumerate(seen):
-        known = len(sight.pixel)
-        paths[frame, :known], fitted[frame, :known] = sight.pixel, sight.sigma
-        leverage[frame, :known], step[frame, :known] = sight.leverage, sight.step
-    for column, newcomer in enumerate(late, start=count - len(late)):
-        for frame, (pixel, sigma) in newcomer.seen.items():
-            paths[frame, column], fitted[frame, column] = pixel, sigma
-    return paths, fitted, leverage, step, np.array([sight.lag for sight in seen])
+    pixel, sigma, noise_gain = np.full((3, len(detections), count, 2), np.nan)
+    step = np.full((len(detections), count), np.nan)
+    for frame, detected in enumerate(detections):
+        known = len(detected.pixel)
+        pixel[frame, :known], sigma[frame, :known] = detected.pixel, detected.sigma
+        noise_gain[frame, :known], step[frame, :known] = detected.noise_gain, detected.step
+    for column, marker in enumerate(late, start=count - len(late)):
+        for frame, (position, position_sigma) in marker.seen.items():
+            pixel[frame, column], sigma[frame, column] = position, position_sigma
+    return pixel, sigma, noise_gain, step, np.array([detected.lag_factor for detected in detections])
 
 
-def _with_late_ones(start: Array, paths: Array, late: NDArray[np.bool_], marks: NDArray[np.bool_]) -> Array:
-    """Where markers were in the first picture [px], (D, 2): the late ones (D) as in all shapes that showed everybody.
+def _predict_late_starts(start: Array, pixel: Array, late: NDArray[np.bool_], static: NDArray[np.bool_]) -> Array:
+    """The positions at the start [px], (D, 2), with those of late-detected markers predicted from the whole recording.
 
-    What was thought of one when it came into sight rests on a body bent otherwise.
+    Their position estimated at their detection is less accurate, because the body was bent differently then.
 
     Args:
-        start: where they were, late ones by what was thought [px], (D, 2).
-        paths: all that was seen [px], (T, D, 2).
-        late: who came into sight later, (D).
-        marks: who does not ride on the body, (D).
+        start: positions at the start, for late-detected markers as estimated at their detection [px], (D, 2).
+        pixel: positions in all frames [px], (T, D, 2).
+        late: which markers were detected late, (D).
+        static: which are static dots, (D).
     """
-    memory, telling = Memory(start), ~late & ~marks
-    for place in paths[np.isfinite(paths[..., 0]).all(axis=1)]:
-        memory.add(place, np.ones(len(start), bool))
-    if len(memory) < FEW_SHAPES or not telling.any():
+    prior, known = ShapePrior(start), ~late & ~static
+    for positions in pixel[np.isfinite(pixel[..., 0]).all(axis=1)]:
+        prior.add_shape(positions, np.ones(len(start), bool))
+    if len(prior) < MIN_SHAPES or not known.any():
         return start
-    return np.where((late & ~marks)[:, None], memory.carried(start, telling).place, start)
+    return np.where((late & ~static)[:, None], prior.predict(start, known).position, start)
 
 
-class _Album:
-    """The first frame, and those in which most markers are lost or worst located."""
+class _WorstFrames:
+    """The first frame and the worst ones: those with most markers missing or the largest sigma."""
 
     def __init__(self) -> None:
-        self.first: tuple[int, NDArray] | None = None
-        self.worst: list[tuple[float, int, NDArray]] = []  # a heap, the least bad on top
+        self.first: tuple[int, Array] | None = None
+        self.worst: list[tuple[float, int, Array]] = []  # a heap with the least bad frame first
 
-    def consider(self, number: int, picture: NDArray, sigma: Array) -> None:
-        """Keeps a picture if it is among the worst so far."""
+    def consider(self, number: int, image: Array, sigma: Array) -> None:
+        """Keep a frame's image if it is one of the worst so far; `sigma` are its markers' [px], (D, 2)."""
         badness = float(sigma.max(initial=0.0))
-        if badness != badness:  # some are not seen
+        if badness != badness:  # NaN: some markers are missing
             located = sigma[sigma == sigma]
             badness = len(sigma) - 0.5 * len(located) + float(located.max(initial=0.0))
-        if self.first is not None and len(self.worst) == WORST and badness <= self.worst[0][0]:
+        if self.first is not None and len(self.worst) == WORST_FRAME_COUNT and badness <= self.worst[0][0]:
             return
         if self.first is None:
-            self.first = (number, picture)
+            self.first = (number, image)
         else:
-            push = heapq.heappush if len(self.worst) < WORST else heapq.heappushpop
-            push(self.worst, (badness, number, picture))
+            push = heapq.heappush if len(self.worst) < WORST_FRAME_COUNT else heapq.heappushpop
+            push(self.worst, (badness, number, image))
 
-    def pictures(self) -> dict[int, bytes]:
-        """JPEG by frame."""
-        kept = {number: picture for _, number, picture in self.worst}
+    def encode(self) -> dict[int, bytes]:
+        """The images as JPEG, by frame number."""
+        kept = {number: image for _, number, image in self.worst}
         kept |= {} if self.first is None else {self.first[0]: self.first[1]}
         quality = [cv2.IMWRITE_JPEG_QUALITY, 80]
         return {
-            number: cv2.imencode(".jpg", eight_bits(picture), quality)[1].tobytes() for number, picture in kept.items()
+            number: cv2.imencode(".jpg", to_eight_bits(image), quality)[1].tobytes() for number, image in kept.items()
         }

@@ -1,4 +1,4 @@
-"""A dot that may be a marker that is not known yet, look by look, and whether the body carries it."""
+"""A dot that may be a late-detected marker: its observations, and the test whether it moves with the body."""
 
 from collections import deque
 from dataclasses import dataclass, field
@@ -9,87 +9,102 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-LOOKS = 5  # that show a moving dot before it is believed
-CARRIED = 0.5  # of its way: how far it may move on the body the while
-LONG, LEAST = 15, 0.05  # looks and px: likewise, of a dot that hardly moves
-MODES, ALONE = 2, 0.1  # ways of the body to move, and of the variance of such a dot's way: what these may not explain
-ASTRAY = 0.4, 0.6  # of the way of the marker that moves most: how far it may seem to move on the body; if explained
-STEADY = 1.0  # px: root mean square way of what stands still, though the camera may not
-KEPT = 40  # looks
-SEEMING = 0.3  # of how far it seems to move on the body: so much farther is a dot that keeps its place in the picture
+# "Spread" below: root mean square distance from the mean position.
+MIN_OBSERVATIONS = 5  # of a clearly moving dot, before it is accepted
+MAX_REST_SPREAD_RATIO = 0.5  # its spread on the body, relative to that in the image
+LONG_HISTORY, MIN_SPREAD = 15, 0.05  # observations needed of a dot that hardly moves, and its least spread [px]
+BODY_MODES = 2  # modes of the body's motion, which must explain the motion of a dot that hardly moves
+MAX_UNEXPLAINED_VARIANCE = 0.1  # share of its variance that they may leave
+# A dot that hardly moves may have a spread on the body of this much, relative to the spread of the marker that moves
+# most. Between the two limits, the permitted unexplained variance falls linearly to zero.
+REST_SPREAD_LIMITS = 0.4, 0.6
+MAX_STATIC_SPREAD = 1.0  # of a static dot, seen by a camera that may shake [px]
+MAX_OBSERVATIONS = 40
+REST_GAP_WEIGHT = 0.3  # of the distance on the body, added to the distance in the image
 
 
-class Look(NamedTuple):
-    """What one look shows of a dot.
+class Observation(NamedTuple):
+    """A dot in one frame.
 
     Attributes:
         frame: its number.
-        rest: the dot's place on the body at rest, as the known markers put it [px], (2).
-        place: in the picture [px], (2).
-        body: the known markers' places in the picture [px], (M, 2).
+        rest: the dot's position on the body at rest, predicted from the known markers [px], (2).
+        position: in the image [px], (2).
+        body: the known markers' positions in the image [px], (M, 2).
     """
 
     frame: int
     rest: Array
-    place: Array
+    position: Array
     body: Array
 
 
 @dataclass(eq=False)
 class Candidate:
-    """A dot's last looks, one after the other."""
+    """The last observations of one dot."""
 
-    looks: deque[Look] = field(default_factory=lambda: deque(maxlen=KEPT))
+    observations: deque[Observation] = field(default_factory=lambda: deque(maxlen=MAX_OBSERVATIONS))
 
     @property
     def rest(self) -> Array:
-        """Its places on the body at rest [px], (L, 2)."""
-        return np.array([look.rest for look in self.looks])
+        """Its positions on the body at rest [px], (L, 2)."""
+        return np.array([observation.rest for observation in self.observations])
 
     @property
-    def place(self) -> Array:
-        """Its places in the picture [px], (L, 2)."""
-        return np.array([look.place for look in self.looks])
+    def positions(self) -> Array:
+        """Its positions in the image [px], (L, 2)."""
+        return np.array([observation.position for observation in self.observations])
 
-    def gap(self, rest: Array, place: Array) -> float:
-        """How far from it a dot is that stands there on the body and in the picture [px]."""
-        seeming = float(np.linalg.norm(self.rest - rest, axis=1).min())
-        return min(seeming, float(np.linalg.norm(self.looks[-1].place - place)) + SEEMING * seeming)
+    def distance_to(self, rest: Array, position: Array) -> float:
+        """Distance of a dot at `rest` on the body and at `position` in the image [px], the smaller of two.
 
-    def carried(self) -> bool:
-        """Whether the looks show that the body carries it."""
-        way, stray = _spread(self.place), _spread(self.rest)
-        if len(self.looks) >= LOOKS and way > STEADY and stray < CARRIED * way:
+        The first is that on the body. The second is that in the image plus a part of the first.
+        """
+        rest_distance = float(np.linalg.norm(self.rest - rest, axis=1).min())
+        image_distance = float(np.linalg.norm(self.observations[-1].position - position))
+        return min(rest_distance, image_distance + REST_GAP_WEIGHT * rest_distance)
+
+    def moves_with_body(self) -> bool:
+        """Whether the observations show that it is attached to the body."""
+        spread, rest_spread = _spread(self.positions), _spread(self.rest)
+        clear = spread > MAX_STATIC_SPREAD and rest_spread < MAX_REST_SPREAD_RATIO * spread
+        if len(self.observations) >= MIN_OBSERVATIONS and clear:
             return True
-        return len(self.looks) >= LONG and way > LEAST and self._sways()
+        return len(self.observations) >= LONG_HISTORY and spread > MIN_SPREAD and self._follows_body_modes()
 
-    def rides(self) -> bool:
-        """Whether it moves less on the body than in the picture."""
-        return _spread(self.rest) < _spread(self.place)
+    def moves_less_on_body(self) -> bool:
+        """Whether it moves less relative to the body than in the image."""
+        return _spread(self.rest) < _spread(self.positions)
 
-    def still(self, most: float = np.inf) -> bool:
-        """Whether it keeps its place in the picture; and on the body, to at most so many [px]."""
-        return len(self.looks) >= LONG and _spread(self.place) < STEADY and _spread(self.rest) < most
+    def is_static(self, max_rest_spread: float = np.inf) -> bool:
+        """Whether it stays still in the image, with at most the given spread on the body [px]."""
+        many = len(self.observations) >= LONG_HISTORY
+        return many and _spread(self.positions) < MAX_STATIC_SPREAD and _spread(self.rest) < max_rest_spread
 
-    def settled(self) -> bool:
-        """Whether nothing new is to be expected of it."""
-        return len(self.looks) > 2 * LONG and self.still()
+    def is_long_static(self) -> bool:
+        """Whether it has been static for so long that further observations will hardly change that."""
+        return len(self.observations) > 2 * LONG_HISTORY and self.is_static()
 
-    def _sways(self) -> bool:
-        """Whether it moves when the body moves: beside a clamp, where it moves less than the others can tell."""
-        common = min(len(look.body) for look in self.looks)
-        body = np.stack([look.body[:common].ravel() for look in self.looks])
-        most = np.linalg.norm(body.std(axis=0).reshape(-1, 2), axis=1).max()
-        modes = np.linalg.svd(body - body.mean(axis=0), full_matrices=False)[0][:, :MODES]
-        own = self.place - self.place.mean(axis=0)
-        left = own - modes @ (modes.T @ own)
-        free = len(self.looks) - 1
-        unexplained = (left**2).sum() / (free - MODES) / ((own**2).sum() / free)
-        span = (ASTRAY[1] - ASTRAY[0]) * most
-        explained = unexplained * span < ALONE * min(span, ASTRAY[1] * most - _spread(self.rest))
-        return bool(most > STEADY and explained)
+    def _follows_body_modes(self) -> bool:
+        """Whether the main modes of the body's motion explain its motion.
+
+        This finds markers near the clamp, which move less than the error of the position predicted from the others.
+        """
+        common = min(len(observation.body) for observation in self.observations)
+        body = np.stack([observation.body[:common].ravel() for observation in self.observations])
+        largest_spread = np.linalg.norm(body.std(axis=0).reshape(-1, 2), axis=1).max()
+        modes = np.linalg.svd(body - body.mean(axis=0), full_matrices=False)[0][:, :BODY_MODES]
+        deviation = self.positions - self.positions.mean(axis=0)
+        residual = deviation - modes @ (modes.T @ deviation)
+        freedom = len(self.observations) - 1
+        unexplained = (residual**2).sum() / (freedom - BODY_MODES) / ((deviation**2).sum() / freedom)
+        low, high = REST_SPREAD_LIMITS
+        interval = (high - low) * largest_spread
+        margin = min(interval, high * largest_spread - _spread(self.rest))
+        explained = unexplained * interval < MAX_UNEXPLAINED_VARIANCE * margin
+        return bool(largest_spread > MAX_STATIC_SPREAD and explained)
 
 
-def _spread(places: Array) -> float:
-    """Root mean square distance of places (L, 2) from their mean."""
-    return float(np.linalg.norm(np.std(places, axis=0)))
+def _spread(positions: Array) -> float:
+    """Root mean square distance of positions (L, 2) from their mean."""
+    return float(np.linalg.norm(np.std(positions, axis=0)))

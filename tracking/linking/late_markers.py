@@ -1,8 +1,8 @@
-"""Markers that come into sight after the first frame: from behind a hand, or from outside the picture.
+"""Detecting markers that appear after the first frame, from behind a hand or from outside the image.
 
-A dot is taken in once it moves, in one look after the other, and stays in its place on the body the while; and where
-the last pictures show it there nearly always. What stands still behind the body does neither. Beside a clamp, where
-markers stand still too, a dot that was not there at first is taken in where the body's rows go on.
+A dot becomes a marker if it moves and keeps its position on the body over several observations, and if nearly all of
+the last frames show it there. Background blobs do neither. Near a clamp markers stay still too. There, a static dot
+becomes a marker if it continues the body's rows and the first frame did not show it.
 """
 
 from collections import deque
@@ -11,45 +11,63 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from rafl.tracking.detection.appearance import DIM, IN_LINE, LINES, NEXT, Family, breadth_of, lines_through
-from rafl.tracking.detection.detect import SAME_PLACE, Dots, apart, find_spots, fit_dots, starts_at
-from rafl.tracking.detection.disc_model import PARAMETERS
-from rafl.tracking.detection.truncated import doubted
-from rafl.tracking.linking.late_marker_candidate import Candidate, Look
-from rafl.tracking.linking.matching import NEIGHBOURS, Pattern
-from rafl.tracking.linking.shape_prior import Belief, Memory
 from scipy.optimize import linear_sum_assignment
+
+from rafl.tracking.detection.appearance import (
+    LINE_TOLERANCE,
+    MAX_EXTENSION_ROW_SPACINGS,
+    MIN_CONTRAST_RATIO,
+    MIN_LINES,
+    MarkerAppearance,
+    count_lines_through,
+    row_spacing,
+)
+from rafl.tracking.detection.detect import (
+    MIN_SEPARATION_RADII,
+    Dots,
+    find_blobs,
+    fit_dots,
+    initial_parameters_at,
+    remove_duplicates,
+)
+from rafl.tracking.detection.disc_model import PARAMETER_COUNT
+from rafl.tracking.detection.truncated import truncated_dots
+from rafl.tracking.linking.late_marker_candidate import Candidate, Observation
+from rafl.tracking.linking.matching import NEIGHBOUR_COUNT, MarkerPattern
+from rafl.tracking.linking.shape_prior import PredictedPosition, ShapePrior
 
 Array = NDArray[Any]
 
-# Frames from look to look; where the last one showed a dot that may be one; and where all that it showed keep still.
-EVERY, SOON, SELDOM = 3, 2, 12
-# Last pictures kept, in which candidates are followed back, and their size together; and while there is no candidate.
-KEPT, MOST_BYTES, CALMLY = 60, 2**28, 2
-FREE = 0.55  # spacings: how far on the body from known markers there may be another
-FAR = 2.4  # breadths: how far from them at most
-NEAR = 0.45  # spacings: how far from a candidate the same dot may seem to be at the next look
-UNRIVALLED = 2.0  # times as far: likewise, where every other dot and candidate is as many times as far as that
-SAME = 0.3  # spacings: how far from where it is expected a dot that is followed back may be
-FARTHER, BLUR = 2.0, 0.5  # times as far as between its looks, and px: likewise before its first look
-LOST = 2  # pictures before its first look without it, one after the other: there it was not in sight yet
-FOUND, LEAST_SEEN = 0.8, 3  # of the pictures since its first look, and how many at least: those that must show it
-FEWEST = 3  # markers of the body that tell where on it a dot belongs
-PINNED = 0.15  # spacings: how far a dot that keeps its place in the picture may seem to move on the body
-JUMP = 0.5  # spacings: how far beside the body's motion no dot goes from picture to picture
-HOPPING, RESTING = 0.02, 0.1  # of how far a dot goes in all, and of the body's steps: its steps if it only hops
-ALIKE = 1.2  # ratio of radii within a family
+# Frames between searches: without candidates, with candidates, and if all candidates have long been static.
+IDLE_INTERVAL, CANDIDATE_INTERVAL, STATIC_INTERVAL = 3, 2, 12
+# Frames kept for tracking candidates back, their total size [bytes], and frames kept without candidates.
+MAX_KEPT_FRAMES, MAX_KEPT_BYTES, IDLE_KEPT_FRAMES = 60, 2**28, 2
+MIN_DISTANCE_SPACINGS = 0.55  # on the body, of a late marker from the known ones
+MAX_DISTANCE_ROW_SPACINGS = 2.4  # on the body, of a late marker from the nearest known one
+MAX_CANDIDATE_GAP = 0.45  # apparent displacement of a candidate between two observations [spacings]
+UNIQUE_RATIO = 2.0  # the gap may be this much larger if every other dot and candidate is this much farther away
+BACKTRACK_GATE = 0.3  # most distance of a tracked-back dot from its predicted position [spacings]
+# Before the first observation the gate is at most this many times the largest distance so far, plus this many px.
+EARLIER_GATE_FACTOR, EARLIER_GATE_PX = 2.0, 0.5
+MAX_LOST_FRAMES = 2  # before the first observation: after so many frames in a row without the dot, tracking back ends
+MIN_FOUND_SHARE, MIN_FOUND_FRAMES = 0.8, 3  # of the frames since its first observation, those that must show the dot
+MIN_BODY_MARKERS = 3  # visible, to determine a dot's position on the body
+MAX_STATIC_REST_SPREAD = 0.15  # spread on the body of a dot that is static in the image [spacings]
+MAX_JUMP = 0.5  # of one dot relative to the body, from frame to frame [spacings]
+# Several dots were taken for one if the median step is below both: shares of the path's spread and of the body's step.
+MIN_STEP_TO_SPREAD, MIN_STEP_TO_BODY_STEP = 0.02, 0.1
+MAX_RADIUS_RATIO = 1.2  # of a late marker and the median one, either way
 
 
 @dataclass(frozen=True)
-class Newcomer:
-    """A marker that came into sight late.
+class LateMarker:
+    """A late-detected marker.
 
     Attributes:
-        rest: where it belongs in the pattern [px], (2).
-        sigma: standard deviation of that along x and along y [px].
+        rest: its position in the marker pattern [px], (2).
+        sigma: standard deviation of `rest` along x and along y [px].
         parameters: of its disc, (12).
-        seen: its place and sigma [px] by frame, up to the present one.
+        seen: its position and sigma [px], (2) each, by frame, up to the present one.
     """
 
     rest: Array
@@ -58,254 +76,282 @@ class Newcomer:
     seen: dict[int, tuple[Array, Array]]
 
 
-class _Earlier(NamedTuple):
-    """A picture, the known markers' places there [px], (M, 2), and which of these tell of the body, (M)."""
+class _KeptFrame(NamedTuple):
+    """A frame, the known markers' positions there [px], (M, 2), and which of these are visible on the body, (M)."""
 
     number: int
-    image: NDArray
-    place: Array
+    image: Array
+    positions: Array
     body: NDArray[np.bool_]
 
 
 @dataclass
-class Newcomers:
-    """Looks out for markers that are not known yet.
+class LateMarkerFinder:
+    """Finds markers that are not known yet.
 
     Attributes:
-        family: what they look like.
-        unsure: standard deviation of where in the pattern each known marker belongs [px], (M).
+        appearance: of the markers.
+        rest_sigma: standard deviation of each known marker's position in the pattern [px], (M).
     """
 
-    family: Family
-    unsure: Array
+    appearance: MarkerAppearance
+    rest_sigma: Array
     _candidates: list[Candidate] = field(default_factory=list)
-    _due: int = 0  # frame of the next look
-    _recent: deque[_Earlier] = field(default_factory=deque)
-    _first: NDArray | None = None  # picture
+    _next_search: int = 0  # frame
+    _kept_frames: deque[_KeptFrame] = field(default_factory=deque)
+    _first_image: Array | None = None
 
-    def look(
+    def find(
         self,
         number: int,
-        image: NDArray,
-        place: Array,
+        image: Array,
+        positions: Array,
         seen: NDArray[np.bool_],
-        marks: NDArray[np.bool_],
-        pattern: Pattern,
+        static: NDArray[np.bool_],
+        pattern: MarkerPattern,
         parameters: Array,
-    ) -> list[Newcomer]:
-        """Markers that have become known.
+    ) -> list[LateMarker]:
+        """The markers that this frame confirms.
 
         Args:
             number: of the frame.
-            image: its picture.
-            place: of the known markers [px], (M, 2).
+            image: of the frame.
+            positions: of the known markers [px], (M, 2).
             seen: which of them are measured, (M).
-            marks: which of them do not ride on the body, (M).
+            static: which of them are static dots, (M).
             pattern: of the known markers.
             parameters: of their discs, (M, 12).
         """
-        now = _Earlier(number, image, place, seen & ~marks)
-        self._recent.append(now)
-        self._first = image if self._first is None else self._first
-        most = KEPT if self._candidates else CALMLY  # few: decoding is slower in memory that no cache holds
-        while len(self._recent) > max(min(most, MOST_BYTES // image.nbytes), 1):
-            self._recent.popleft()
-        if number < self._due or 2 * now.body.sum() < (~marks).sum():
+        frame = _KeptFrame(number, image, positions, seen & ~static)
+        self._kept_frames.append(frame)
+        self._first_image = image if self._first_image is None else self._first_image
+        most = MAX_KEPT_FRAMES if self._candidates else IDLE_KEPT_FRAMES  # decoding is slower outside the cache
+        while len(self._kept_frames) > max(min(most, MAX_KEPT_BYTES // image.nbytes), 1):
+            self._kept_frames.popleft()
+        if number < self._next_search or 2 * frame.body.sum() < (~static).sum():
             return []
-        spacing, breadth = float(np.median(pattern.spacing)), breadth_of(pattern.rest[now.body])
-        found = self._strangers(image, place, FAR * breadth, 0.5 * FREE * spacing, parameters)
+        spacing, rows = float(np.median(pattern.spacing)), row_spacing(pattern.rest[frame.body])
+        reach, free = MAX_DISTANCE_ROW_SPACINGS * rows, 0.5 * MIN_DISTANCE_SPACINGS * spacing
+        found = self._find_unknown_dots(image, positions, reach, free, parameters)
         if not len(found) and not self._candidates:
-            self._due = number + EVERY
+            self._next_search = number + IDLE_INTERVAL
             return []
-        own = self._at_rest(pattern, now, found).place
-        near = np.linalg.norm(own[:, None] - pattern.rest[now.body], axis=2).min(axis=1) < FAR * breadth
-        self._count(now, own[near], found[near], NEAR * spacing)
-        settled = all(item.settled() for item in self._candidates)
-        self._due = number + (EVERY if not self._candidates else SELDOM if settled else SOON)
-        rest = pattern.rest[~marks]
-        ready = [item for item in self._candidates if item.carried() or self._stands(item, rest, parameters, spacing)]
-        self._candidates = [item for item in self._candidates if item not in ready]
-        newcomers: list[Newcomer] = []
-        for item in ready:
-            newcomer = self._followed_back(item, pattern, parameters, spacing)
-            others = np.concatenate([pattern.rest, *(other.rest[None] for other in newcomers)])
-            if newcomer is not None and np.linalg.norm(others - newcomer.rest, axis=1).min() > FREE * spacing:
-                newcomers.append(newcomer)
-        self.unsure = np.append(self.unsure, [newcomer.sigma for newcomer in newcomers])
-        return newcomers
+        rest_of_dots = self._predict_rest(pattern, frame, found).position
+        distance = np.linalg.norm(rest_of_dots[:, None] - pattern.rest[frame.body], axis=2).min(axis=1)
+        near = distance < MAX_DISTANCE_ROW_SPACINGS * rows
+        self._update_candidates(frame, rest_of_dots[near], found[near], MAX_CANDIDATE_GAP * spacing)
+        static_only = all(candidate.is_long_static() for candidate in self._candidates)
+        interval = IDLE_INTERVAL if not self._candidates else STATIC_INTERVAL if static_only else CANDIDATE_INTERVAL
+        self._next_search = number + interval
+        rest = pattern.rest[~static]
+        ready = [
+            candidate
+            for candidate in self._candidates
+            if candidate.moves_with_body() or self._continues_rows(candidate, rest, parameters, spacing)
+        ]
+        self._candidates = [candidate for candidate in self._candidates if candidate not in ready]
+        markers: list[LateMarker] = []
+        for candidate in ready:
+            marker = self._track_back(candidate, pattern, parameters, spacing)
+            others = np.concatenate([pattern.rest, *(other.rest[None] for other in markers)])
+            least = MIN_DISTANCE_SPACINGS * spacing
+            if marker is not None and np.linalg.norm(others - marker.rest, axis=1).min() > least:
+                markers.append(marker)
+        self.rest_sigma = np.append(self.rest_sigma, [marker.sigma for marker in markers])
+        return markers
 
-    def _strangers(self, image: NDArray, place: Array, reach: float, free: float, parameters: Array) -> Array:
-        """Dots of the family within reach [px] of the body that are no known marker's, so not near one, (D, 2)."""
-        low, high = place.min(0) - reach, place.max(0) + reach
+    def _find_unknown_dots(self, image: Array, positions: Array, reach: float, free: float, parameters: Array) -> Array:
+        """Dots within `reach` [px] of the body, farther than `free` [px] from all known markers, [px], (D, 2)."""
+        low, high = positions.min(0) - reach, positions.max(0) + reach
         region = (int(low[0]), int(low[1]), int(high[0]), int(high[1]))
-        spots = find_spots(image, self.family.radius, self.family.least(self.family.contrast), region, hurried=True)
-        away = np.linalg.norm(spots[:, None] - place[None], axis=2).min(axis=1, initial=np.inf)
-        strange = spots[away > free]
-        if not len(strange):
+        contrast = self.appearance.min_blob_contrast(self.appearance.contrast)
+        blobs = find_blobs(image, self.appearance.radius, contrast, region, fast=True)
+        distance = np.linalg.norm(blobs[:, None] - positions[None], axis=2).min(axis=1, initial=np.inf)
+        unknown = blobs[distance > free]
+        if not len(unknown):
             return np.empty((0, 2))
-        starts = _starts(strange, parameters)
-        dots = fit_dots(image, np.concatenate([starts, _moved(parameters, place)]), len(starts))
-        return apart(dots[self._admitted(dots)], SAME_PLACE * self.family.radius).centre
+        starts = _median_discs(unknown, parameters)
+        dots = fit_dots(image, np.concatenate([starts, _moved_discs(parameters, positions)]), len(starts))
+        return remove_duplicates(dots[self._match(dots)], MIN_SEPARATION_RADII * self.appearance.radius).centre
 
-    def _admitted(self, dots: Dots) -> NDArray[np.bool_]:
-        good = self.family.admits(dots) & (dots.contrast / self.family.contrast > DIM)
-        return good & (np.abs(np.log(dots.radius / self.family.radius)) < np.log(ALIKE))
+    def _match(self, dots: Dots) -> NDArray[np.bool_]:
+        """Which dots look like markers, (D)."""
+        good = self.appearance.matches(dots) & (dots.contrast / self.appearance.contrast > MIN_CONTRAST_RATIO)
+        ratio: NDArray[np.bool_] = np.abs(np.log(dots.radius / self.appearance.radius)) < np.log(MAX_RADIUS_RATIO)
+        return good & ratio
 
-    def _at_rest(self, pattern: Pattern, then: _Earlier, points: Array) -> Belief:
-        """Where points (P, 2) of a picture [px] would be in the pattern."""
+    def _predict_rest(self, pattern: MarkerPattern, frame: _KeptFrame, points: Array) -> PredictedPosition:
+        """Positions in the pattern of points (P, 2) of a frame [px]."""
         if not len(points):
-            return Belief(points, np.empty(0))
-        body, count = np.flatnonzero(then.body), len(points)
+            return PredictedPosition(points, np.empty(0))
+        body, count = np.flatnonzero(frame.body), len(points)
         rest = np.concatenate([pattern.rest[body], points])
-        unsure = np.append(self.unsure[body], np.full(count, np.inf))
-        memory = Memory(np.concatenate([then.place[body], points]))
-        believed = memory.carried(rest, unsure == 0.0, Belief(rest, unsure))
-        return Belief(believed.place[-count:], believed.sigma[-count:])
+        sigma = np.append(self.rest_sigma[body], np.full(count, np.inf))
+        prior = ShapePrior(np.concatenate([frame.positions[body], points]))
+        predicted = prior.predict(rest, sigma == 0.0, PredictedPosition(rest, sigma))
+        return PredictedPosition(predicted.position[-count:], predicted.sigma[-count:])
 
-    def _count(self, now: _Earlier, rest: Array, found: Array, most: float) -> None:
-        """Candidates that this look does not show are given up; what it shows for the first time becomes one.
+    def _update_candidates(self, frame: _KeptFrame, rest: Array, found: Array, max_gap: float) -> None:
+        """Assign dots to candidates. Candidates without a dot are dropped, and dots without one become candidates.
 
         Args:
-            now: the picture.
-            rest: where the dots would be in the pattern [px], (D, 2).
+            frame: the present one.
+            rest: the dots' positions in the pattern [px], (D, 2).
             found: the dots [px], (D, 2).
-            most: how far one may seem to be from where it was before [px], if it has a rival.
+            max_gap: most distance of a dot from its candidate if the assignment is not unique [px].
         """
         before = self._candidates
-        gaps = np.array([[item.gap(*dot) for item in before] for dot in zip(rest, found, strict=True)])
+        dots = zip(rest, found, strict=True)
+        gaps = np.array([[candidate.distance_to(*dot) for candidate in before] for dot in dots])
         gaps = gaps.reshape(len(found), len(before))
-        pairs = zip(*linear_sum_assignment(np.minimum(gaps, UNRIVALLED * most)), strict=True)
-        known = {row: before[column] for row, column in pairs if _matches(gaps, row, column, most)}
+        pairs = zip(*linear_sum_assignment(np.minimum(gaps, UNIQUE_RATIO * max_gap)), strict=True)
+        known = {row: before[column] for row, column in pairs if _is_match(gaps, row, column, max_gap)}
         self._candidates = [known.get(row, Candidate()) for row in range(len(found))]
-        for item, own, place in zip(self._candidates, rest, found, strict=True):
-            item.looks.append(Look(now.number, own, place, now.place))
+        for candidate, own_rest, position in zip(self._candidates, rest, found, strict=True):
+            candidate.observations.append(Observation(frame.number, own_rest, position, frame.positions))
 
-    def _stands(self, candidate: Candidate, rest: Array, parameters: Array, spacing: float) -> bool:
-        """Whether it stands still where the rows of the body at rest (M, 2) go on, and did not at first."""
-        if not candidate.still(PINNED * spacing) or candidate.settled() or self._first is None:
+    def _continues_rows(self, candidate: Candidate, rest: Array, parameters: Array, spacing: float) -> bool:
+        """Whether a static candidate continues the rows of the body at rest (M, 2), and was not in the first frame."""
+        if (
+            not candidate.is_static(MAX_STATIC_REST_SPREAD * spacing)
+            or candidate.is_long_static()
+            or self._first_image is None
+        ):
             return False
-        own, beside = np.median(candidate.rest, axis=0), IN_LINE * spacing
-        if np.linalg.norm(rest - own, axis=1).min() > NEXT * breadth_of(rest):
+        position, tolerance = np.median(candidate.rest, axis=0), LINE_TOLERANCE * spacing
+        if np.linalg.norm(rest - position, axis=1).min() > MAX_EXTENSION_ROW_SPACINGS * row_spacing(rest):
             return False
-        least = min(lines_through(place, np.delete(rest, k, axis=0), beside) for k, place in enumerate(rest))
-        if lines_through(own, rest, beside) < np.clip(least, 1, LINES):
+        least = min(count_lines_through(own, np.delete(rest, k, axis=0), tolerance) for k, own in enumerate(rest))
+        if count_lines_through(position, rest, tolerance) < np.clip(least, 1, MIN_LINES):
             return False
-        return not self._admitted(fit_dots(self._first, _starts(candidate.place[-1:], parameters)))[0]
+        at_first = fit_dots(self._first_image, _median_discs(candidate.positions[-1:], parameters))
+        return not self._match(at_first)[0]
 
-    def _followed_back(
-        self, candidate: Candidate, pattern: Pattern, parameters: Array, spacing: float
-    ) -> Newcomer | None:
-        """The candidate in the last pictures; None where too few since its first look show it, or several dots."""
-        first = candidate.looks[0].frame
-        carried = self._carried_since(pattern.rest, np.median(candidate.rest, axis=0), first)
-        if not candidate.rides():  # followed where it is in the picture, not where it seems to be on the body
+    def _track_back(
+        self, candidate: Candidate, pattern: MarkerPattern, parameters: Array, spacing: float
+    ) -> LateMarker | None:
+        """The candidate tracked back through the kept frames.
+
+        None if too few frames since its first observation show it, or if it is several dots.
+        """
+        first = candidate.observations[0].frame
+        carried = self._predict_since(pattern.rest, np.median(candidate.rest, axis=0), first)
+        if not candidate.moves_less_on_body():  # track it relative to the image, not to the body
             carried = dict.fromkeys(carried, np.zeros(2))
-        looks = [look for look in candidate.looks if look.frame in carried]
-        frames, stray = [look.frame for look in looks], np.array([look.place - carried[look.frame] for look in looks])
+        observed = [item for item in candidate.observations if item.frame in carried]
+        frames = [item.frame for item in observed]
+        offsets = np.array([item.position - carried[item.frame] for item in observed])
         seen: dict[int, tuple[Array, Array]] = {}
-        shown = np.full(PARAMETERS, np.nan)
-        since = lost = 0
-        off, farthest = stray[-1], 0.0
-        for then in reversed(self._recent):
-            between = then.number >= first
-            if between:
-                since += 1
-                off = np.array([np.interp(then.number, frames, along) for along in stray.T])
-            expected = carried[then.number] + off
-            near = np.argsort(np.linalg.norm(then.place - expected, axis=1))[:NEIGHBOURS]
-            starts = np.concatenate([_starts(expected[None], parameters), _moved(parameters[near], then.place[near])])
-            dots = doubted(then.image, fit_dots(then.image, starts, 1))
+        disc = np.full(PARAMETER_COUNT, np.nan)
+        frames_since_first = lost = 0
+        offset, largest_miss = offsets[-1], 0.0
+        for frame in reversed(self._kept_frames):
+            since_first = frame.number >= first
+            if since_first:
+                frames_since_first += 1
+                offset = np.array([np.interp(frame.number, frames, component) for component in offsets.T])
+            expected = carried[frame.number] + offset
+            near = np.argsort(np.linalg.norm(frame.positions - expected, axis=1))[:NEIGHBOUR_COUNT]
+            neighbours = _moved_discs(parameters[near], frame.positions[near])
+            starts = np.concatenate([_median_discs(expected[None], parameters), neighbours])
+            dots = truncated_dots(frame.image, fit_dots(frame.image, starts, 1))
             miss = float(np.linalg.norm(dots.centre[0] - expected))
-            if self._admitted(dots)[0] and miss < (
-                SAME * spacing if between else min(SAME * spacing, FARTHER * farthest + BLUR)
-            ):
-                farthest, lost, off = max(farthest, miss), 0, off + dots.centre[0] - expected
-                shown = shown if seen else dots.parameters[0]
-                seen[then.number] = dots.centre[0], dots.sigma[0]
-            elif not between:
+            gate = BACKTRACK_GATE * spacing
+            if not since_first:
+                gate = min(gate, EARLIER_GATE_FACTOR * largest_miss + EARLIER_GATE_PX)
+            if self._match(dots)[0] and miss < gate:
+                largest_miss, lost, offset = max(largest_miss, miss), 0, offset + dots.centre[0] - expected
+                disc = disc if seen else dots.parameters[0]
+                seen[frame.number] = dots.centre[0], dots.sigma[0]
+            elif not since_first:
                 lost += 1
-                if lost == LOST:
+                if lost == MAX_LOST_FRAMES:
                     break
         path = np.array([(seen[number][0], carried[number]) for number in seen if number >= first]).reshape(-1, 2, 2)
-        if len(path) < max(FOUND * since, LEAST_SEEN) or _hops(path[:, 0], path[:, 1], spacing):
+        least = max(MIN_FOUND_SHARE * frames_since_first, MIN_FOUND_FRAMES)
+        if len(path) < least or _is_several_dots(path[:, 0], path[:, 1], spacing):
             return None
-        home = self._home(pattern, seen)
-        return None if home is None else Newcomer(*home, shown, seen)
+        rest = self._estimate_rest(pattern, seen)
+        return None if rest is None else LateMarker(*rest, disc, seen)
 
-    def _carried_since(self, rest: Array, own: Array, first: int) -> dict[int, Array]:
-        """Where the markers put a dot in the last pictures [px], (2), by frame.
+    def _predict_since(self, rest: Array, own_rest: Array, first: int) -> dict[int, Array]:
+        """A dot's positions in the kept frames, predicted from the known markers [px], (2), by frame.
 
-        Always the same markers since its first look, as more of them put it elsewhere; where fewer were known before,
-        those carry it on from there.
+        The same markers are used since its first observation, because further markers would shift the prediction. In
+        earlier frames with fewer known markers, these continue it without a jump.
 
         Args:
-            rest: where markers belong in the pattern [px], (M, 2).
-            own: where the dot does [px], (2).
-            first: frame of its first look.
+            rest: the markers' positions in the pattern [px], (M, 2).
+            own_rest: the dot's position in the pattern [px], (2).
+            first: frame of its first observation.
         """
-        count = min(len(then.place) for then in self._recent if then.number >= first)
-        memory, off = Memory(np.concatenate([rest[:count], own[None]])), np.zeros(2)
+        count = min(len(frame.positions) for frame in self._kept_frames if frame.number >= first)
+        prior, offset = ShapePrior(np.concatenate([rest[:count], own_rest[None]])), np.zeros(2)
         carried: dict[int, Array] = {}
-        for then, later in zip(reversed(self._recent), [None, *reversed(self._recent)], strict=False):
-            if later is not None and len(then.place) < count:
-                count = len(then.place)
-                memory = Memory(np.concatenate([rest[:count], own[None]]))
-                off = carried[later.number] - _carried(memory, later, count)
-            carried[then.number] = _carried(memory, then, count) + off
+        for frame, later in zip(reversed(self._kept_frames), [None, *reversed(self._kept_frames)], strict=False):
+            if later is not None and len(frame.positions) < count:
+                count = len(frame.positions)
+                prior = ShapePrior(np.concatenate([rest[:count], own_rest[None]]))
+                offset = carried[later.number] - _predict_last(prior, later, count)
+            carried[frame.number] = _predict_last(prior, frame, count) + offset
         return carried
 
-    def _home(self, pattern: Pattern, seen: dict[int, tuple[Array, Array]]) -> tuple[Array, float] | None:
-        """Where in the pattern a dot belongs, and how well that is known [px], by its places and sigma by frame.
+    def _estimate_rest(
+        self, pattern: MarkerPattern, seen: dict[int, tuple[Array, Array]]
+    ) -> tuple[Array, float] | None:
+        """A dot's position in the pattern [px], (2), and its sigma [px], from its positions and sigma by frame.
 
-        Best where the body was bent as it is in the pattern; None where no picture shows enough of that.
+        The frame is used in which the body's shape is most similar to the pattern. None if no frame shows enough of it.
         """
-        beliefs = []
-        for then in self._recent:
-            body = np.flatnonzero(then.body)
-            if then.number in seen and len(body) >= FEWEST:
-                place, sigma = self._at_rest(pattern, then, seen[then.number][0][None])
-                unlike = np.hypot(_bent(pattern.rest[body], then.place[body]), sigma[0])
-                beliefs.append((float(unlike), then.number, place[0], float(sigma[0])))
-        return min(beliefs)[2:] if beliefs else None
+        estimates = []
+        for frame in self._kept_frames:
+            body = np.flatnonzero(frame.body)
+            if frame.number in seen and len(body) >= MIN_BODY_MARKERS:
+                position, sigma = self._predict_rest(pattern, frame, seen[frame.number][0][None])
+                error = np.hypot(_shape_difference(pattern.rest[body], frame.positions[body]), sigma[0])
+                estimates.append((float(error), frame.number, position[0], float(sigma[0])))
+        return min(estimates)[2:] if estimates else None
 
 
-def _matches(gaps: Array, row: int, column: int, most: float) -> bool:
-    """Whether of the gaps between dots and candidates (D, C) this is small enough, if need be for want of a rival."""
+def _is_match(gaps: Array, row: int, column: int, max_gap: float) -> bool:
+    """Whether dot `row` is candidate `column`, given all distances [px], (D, C)."""
     gap, others = gaps[row, column], np.append(np.delete(gaps[row], column), np.delete(gaps[:, column], row))
-    alone = UNRIVALLED * gap < others.min(initial=np.inf)
-    return bool(gap < (UNRIVALLED * most if alone else most))
+    unique = UNIQUE_RATIO * gap < others.min(initial=np.inf)
+    return bool(gap < (UNIQUE_RATIO * max_gap if unique else max_gap))
 
 
-def _carried(memory: Memory, then: _Earlier, count: int) -> Array:
-    """Where the first so many markers of a picture put the one that comes after them in the memory [px], (2)."""
-    place, known = np.append(then.place[:count], [[0.0, 0.0]], axis=0), np.append(then.body[:count], False)
-    return memory.carried(place, known).place[-1]
+def _predict_last(prior: ShapePrior, frame: _KeptFrame, count: int) -> Array:
+    """Position of the prior's last marker [px], (2), predicted from the first `count` markers of a frame."""
+    positions = np.append(frame.positions[:count], [[0.0, 0.0]], axis=0)
+    last: Array = prior.predict(positions, np.append(frame.body[:count], False)).position[-1]
+    return last
 
 
-def _hops(found: Array, carried: Array, spacing: float) -> bool:
-    """Whether what was followed [px], (T, 2), is one dot after the other.
+def _is_several_dots(found: Array, carried: Array, spacing: float) -> bool:
+    """Whether a tracked path [px], (T, 2), goes from dot to dot.
 
-    Then it jumps from where the body would have carried it on, (T, 2), to the next; or they mostly stand still.
+    Then it jumps relative to the positions predicted from the body, (T, 2), or it stays still for most of the time.
     """
-    if np.linalg.norm(np.diff(found - carried, axis=0), axis=1).max() > JUMP * spacing:
+    if np.linalg.norm(np.diff(found - carried, axis=0), axis=1).max() > MAX_JUMP * spacing:
         return True
-    steps, body = (np.median(np.linalg.norm(np.diff(way, axis=0), axis=1)) for way in (found, carried))
-    return bool(steps < HOPPING * np.linalg.norm(np.std(found, axis=0)) and steps < RESTING * body)
+    step, body_step = (np.median(np.linalg.norm(np.diff(path, axis=0), axis=1)) for path in (found, carried))
+    spread = np.linalg.norm(np.std(found, axis=0))
+    return bool(step < MIN_STEP_TO_SPREAD * spread and step < MIN_STEP_TO_BODY_STEP * body_step)
 
 
-def _bent(rest: Array, place: Array) -> float:
-    """How far places (M, 2) are from those at rest moved, turned and scaled to fit them: root mean square [px]."""
-    before, after = ((item - item.mean(axis=0)) @ [1.0, 1j] for item in (rest, place))
-    left = after - before * np.vdot(before, after) / np.vdot(before, before)
-    return float(np.sqrt((np.abs(left) ** 2).mean()))
+def _shape_difference(rest: Array, positions: Array) -> float:
+    """Root mean square difference [px] of positions (M, 2) and rest positions, after a similarity transform."""
+    before, after = ((item - item.mean(axis=0)) @ [1.0, 1j] for item in (rest, positions))
+    residual = after - before * np.vdot(before, after) / np.vdot(before, before)
+    return float(np.sqrt((np.abs(residual) ** 2).mean()))
 
 
-def _starts(places: Array, parameters: Array) -> Array:
-    """Of fits (D, 12) at places (D, 2): discs as the known markers' are."""
-    usual = np.nanmedian(parameters, axis=0)
-    return starts_at(places, usual[2:5], usual[8], usual[9])
+def _median_discs(positions: Array, parameters: Array) -> Array:
+    """Initial parameters (D, 12) of discs at positions (D, 2), with the known markers' median shape and contrast."""
+    median = np.nanmedian(parameters, axis=0)
+    return initial_parameters_at(positions, median[2:5], median[8], median[9])
 
 
-def _moved(parameters: Array, place: Array) -> Array:
-    """Discs at other places."""
-    return np.concatenate([place, parameters[:, 2:]], axis=1)
+def _moved_discs(parameters: Array, positions: Array) -> Array:
+    """The discs' parameters (D, 12) with the centres moved to positions (D, 2)."""
+    return np.concatenate([positions, parameters[:, 2:]], axis=1)

@@ -1,4 +1,4 @@
-"""Where the markers sit on the undeformed specimen."""
+"""The marker layout: names and positions of the markers on the undeformed specimen."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,19 +20,19 @@ class MarkerEntry(StrictModel):
     at_mm: tuple[float, float, float]
 
 
-def _different_names(markers: list[MarkerEntry]) -> list[MarkerEntry]:
+def _check_unique_names(markers: list[MarkerEntry]) -> list[MarkerEntry]:
     names = [marker.name for marker in markers]
-    twice = {name for name in names if names.count(name) > 1}
-    if twice:
-        raise ValueError(f"expected different names, {sorted(twice)[0]} occurs twice")
+    repeated = {name for name in names if names.count(name) > 1}
+    if repeated:
+        raise ValueError(f"expected different names, {sorted(repeated)[0]} occurs more than once")
     return markers
 
 
-MarkerList = Annotated[list[MarkerEntry], AfterValidator(_different_names)]
+MarkerList = Annotated[list[MarkerEntry], AfterValidator(_check_unique_names)]
 
 
 class MarkerEntries(BaseModel):
-    """The part of a specimen file that tracking reads; the rest is for others."""
+    """The part of a specimen file that tracking reads. Other keys are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -42,7 +42,7 @@ class MarkerEntries(BaseModel):
 
 @dataclass(frozen=True)
 class MarkerLayout:
-    """Names (M) and rest positions (M, 3) in the specimen frame [m]."""
+    """The markers' names (M) and rest positions in the specimen frame [m], (M, 3)."""
 
     names: tuple[str, ...]
     positions: NDArray[np.float64]
@@ -55,10 +55,10 @@ class MarkerLayout:
 
 
 def read_layout(path: Path) -> MarkerLayout:
-    """Read the markers of a specimen file.
+    """Read the markers of a specimen file (specimen.yaml).
 
     Raises:
-        InputError: missing, damaged, or of a newer version.
+        InputError: the file is missing, damaged, or of a newer version.
     """
     content = read_yaml(path, MarkerEntries, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
     return MarkerLayout.of(content.markers)

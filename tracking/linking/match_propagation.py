@@ -1,23 +1,32 @@
-"""How a match of dots to a body's markers spreads from neighbour to neighbour.
+"""Compiled kernels that spread a match of dots to markers from neighbour to neighbour.
 
-Each step trusts the affine map of the matches around it, drawn a little towards the expected one. The arguments that
-all of these functions share are those of `rafl.tracking.linking.matching`: markers' shape and expected places (M, 2) [px], the expected
-motion's linear part (M, 2, 2), their spacing (M) and neighbours (M, K), and the picture's dots (D, 2).
+Each step predicts a marker from the affine map of the matches around it, regularised towards the expected map. Shared
+arguments:
+
+- shape (M, 2): the markers as last seen [px].
+- expected (M, 2): their expected positions [px].
+- linear (M, 2, 2): the linear part of the expected motion about each marker.
+- spacing (M) [px] and neighbours (M, K), -1 filled: see `MarkerPattern`.
+- dots (D, 2): of the frame [px].
+- buckets (R, C, B): dots by square of side `cell` from `origin` [px], -1 filled.
+- distance_cost: score lost by a dot one spacing from its expected position.
+- steady_bonus (M): score gained by a marker exactly at its expected position.
+- taken (D): whether a dot is matched; match (M): the dot of each marker, -1 for none.
 """
 
 import numpy as np
 from numba import njit
 
-STIFFNESS = 0.04  # of neighbours' own spread: how firmly local maps hold on to the expected one
-GATE = 0.36  # of a marker's spacing: how far from where its neighbours put it a dot may be
-ROUGH = 0.5  # of a marker: what a dot at the gate's edge costs
-AMBIGUOUS = 0.75  # of a marker: a match that explains less than so much less may be right as well
+STIFFNESS = 0.04  # weight of the expected map, relative to the mean square distance of the matched neighbours
+GATE_SPACINGS = 0.36  # most distance of a dot from its predicted position
+MISFIT_COST = 0.5  # score lost by a dot at the gate's edge; a matched marker scores 1
+AMBIGUITY_MARGIN = 0.75  # a match whose score is less than this below the best one's may be right as well
 
 
 @njit(cache=True, nogil=True)
-def _predicted(marker, shape, linear, spacing, neighbours, dots, match):
-    """Where a marker's matched neighbours put it: their affine map, drawn towards the expected one."""
-    sw = sx = sy = tx = ty = 0.0  # sums over neighbours, places taken from the marker's own
+def _predict(marker, shape, linear, spacing, neighbours, dots, match):
+    """A marker's position (x, y) from the regularised affine map of its matched neighbours."""
+    sw = sx = sy = tx = ty = 0.0  # sums over neighbours, relative to the marker's own position
     mxx = mxy = myy = nxx = nxy = nyx = nyy = 0.0
     for k in range(neighbours.shape[1]):
         other = neighbours[marker, k]
@@ -37,7 +46,7 @@ def _predicted(marker, shape, linear, spacing, neighbours, dots, match):
             nxy += g * vx * uy
             nyx += g * vy * ux
             nyy += g * vy * uy
-    if sw == 0.0:  # apart from all that is matched: from the nearest matched marker
+    if sw == 0.0:  # no matched neighbour: use the nearest matched marker
         nearest = np.inf
         for other in range(shape.shape[0]):
             if match[other] >= 0:
@@ -66,7 +75,7 @@ def _predicted(marker, shape, linear, spacing, neighbours, dots, match):
 
 @njit(cache=True, nogil=True)
 def _nearest_free(x, y, gate, dots, taken, buckets, cell, origin):
-    """The nearest dot not taken within the gate of (x, y), -1 for none."""
+    """The nearest dot within `gate` [px] of (x, y) that is not taken, -1 for none."""
     found = -1
     nearest = gate
     column, row = int((x - origin[0]) / cell), int((y - origin[1]) / cell)
@@ -84,8 +93,8 @@ def _nearest_free(x, y, gate, dots, taken, buckets, cell, origin):
 
 
 @njit(cache=True, nogil=True)
-def _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match):
-    """Gives up matches that their neighbours contradict, and looks again for markers that found none."""
+def _refine(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match):
+    """Drop matches that contradict their neighbours, and search again for unmatched markers. Changes match in place."""
     for _ in range(2):
         for marker in range(shape.shape[0]):
             own = match[marker]
@@ -97,37 +106,52 @@ def _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, tak
             if around < 3:
                 continue
             match[marker] = -1
-            x, y = _predicted(marker, shape, linear, spacing, neighbours, dots, match)
+            x, y = _predict(marker, shape, linear, spacing, neighbours, dots, match)
             if own >= 0:
-                if np.hypot(dots[own, 0] - x, dots[own, 1] - y) < 1.3 * GATE * spacing[marker]:
+                if np.hypot(dots[own, 0] - x, dots[own, 1] - y) < 1.3 * GATE_SPACINGS * spacing[marker]:
                     match[marker] = own
                 else:
                     taken[own] = False
             else:
-                found = _nearest_free(x, y, GATE * spacing[marker], dots, taken, buckets, cell, origin)
+                found = _nearest_free(x, y, GATE_SPACINGS * spacing[marker], dots, taken, buckets, cell, origin)
                 if found >= 0:
                     match[marker] = found
                     taken[found] = True
 
 
 @njit(cache=True, nogil=True)
-def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, sure, seed, match):
-    """Spread the match of a seed, one marker and one dot, and of sure ones (M), -1 for none; fills match (M) likewise.
+def _propagate(
+    shape,
+    expected,
+    linear,
+    spacing,
+    neighbours,
+    dots,
+    buckets,
+    cell,
+    origin,
+    distance_cost,
+    steady_bonus,
+    confirmed,
+    seed,
+    match,
+):
+    """Fill match (M) by spreading from a seed (marker, dot) and the confirmed dots (M), -1 for none. Returns its score.
 
-    Returns the match's score; a marker counts up to 1 + steady (M) where it is expected. buckets (R, C, B): dots by
-    square of side `cell` from `origin`, -1 filled.
+    The unmatched marker with most matched neighbours comes next. Each matched marker scores 1, plus its steady bonus,
+    less its costs.
     """
     count = shape.shape[0]
-    visited = sure >= 0
+    visited = confirmed >= 0
     taken = np.zeros(dots.shape[0], np.bool_)
-    ready = np.zeros(count, np.int64)  # matched neighbours
-    match[:] = sure
+    matched_neighbours = np.zeros(count, np.int64)
+    match[:] = confirmed
     for marker in range(count):
-        if sure[marker] >= 0:
-            taken[sure[marker]] = True
+        if confirmed[marker] >= 0:
+            taken[confirmed[marker]] = True
             for k in range(neighbours.shape[1]):
                 if neighbours[marker, k] >= 0:
-                    ready[neighbours[marker, k]] += 1
+                    matched_neighbours[neighbours[marker, k]] += 1
     marker, found = seed[0], seed[1]
     while True:
         visited[marker] = True
@@ -136,17 +160,17 @@ def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, ori
             taken[found] = True
             for k in range(neighbours.shape[1]):
                 if neighbours[marker, k] >= 0:
-                    ready[neighbours[marker, k]] += 1
+                    matched_neighbours[neighbours[marker, k]] += 1
         best = -1
         for other in range(count):
-            if not visited[other] and (best < 0 or ready[other] > ready[best]):
+            if not visited[other] and (best < 0 or matched_neighbours[other] > matched_neighbours[best]):
                 best = other
         if best < 0:
             break
         marker = best
-        x, y = _predicted(marker, shape, linear, spacing, neighbours, dots, match)
-        found = _nearest_free(x, y, GATE * spacing[marker], dots, taken, buckets, cell, origin)
-    _settle(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match)
+        x, y = _predict(marker, shape, linear, spacing, neighbours, dots, match)
+        found = _nearest_free(x, y, GATE_SPACINGS * spacing[marker], dots, taken, buckets, cell, origin)
+    _refine(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match)
     score = 0.0
     total = (match >= 0).sum()
     for marker in range(count):
@@ -156,28 +180,44 @@ def _grow(shape, expected, linear, spacing, neighbours, dots, buckets, cell, ori
         score += 1.0
         if total > 1:
             match[marker] = -1
-            x, y = _predicted(marker, shape, linear, spacing, neighbours, dots, match)
+            x, y = _predict(marker, shape, linear, spacing, neighbours, dots, match)
             match[marker] = found
-            misfit = np.hypot(dots[found, 0] - x, dots[found, 1] - y) / (GATE * spacing[marker])
-            score -= ROUGH * min(misfit * misfit, 1.5)
-        away = np.hypot(dots[found, 0] - expected[marker, 0], dots[found, 1] - expected[marker, 1])
-        score -= far * min(away / spacing[marker], 3.0)
-        score += steady[marker] * max(1.0 - away / spacing[marker], 0.0)
+            misfit = np.hypot(dots[found, 0] - x, dots[found, 1] - y) / (GATE_SPACINGS * spacing[marker])
+            score -= MISFIT_COST * min(misfit * misfit, 1.5)
+        distance = np.hypot(dots[found, 0] - expected[marker, 0], dots[found, 1] - expected[marker, 1])
+        score -= distance_cost * min(distance / spacing[marker], 3.0)
+        score += steady_bonus[marker] * max(1.0 - distance / spacing[marker], 0.0)
     return score
 
 
 @njit(cache=True, nogil=True)
-def best_growth(
-    shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, seeds, enough, best
+def best_match(
+    shape,
+    expected,
+    linear,
+    spacing,
+    neighbours,
+    dots,
+    buckets,
+    cell,
+    origin,
+    distance_cost,
+    steady_bonus,
+    seeds,
+    sufficient_score,
+    best,
 ):
-    """Tries seeds (S, 2) of marker and dot until a score reaches `enough`; fills best (M)."""
-    match, nobody = np.empty(shape.shape[0], np.int64), np.full(shape.shape[0], -1)
+    """Fill best (M) with the best match from seeds (S, 2) of marker and dot, in order. Returns its score.
+
+    Stops at the first score of at least `sufficient_score`.
+    """
+    match, none_confirmed = np.empty(shape.shape[0], np.int64), np.full(shape.shape[0], -1)
     highest = -np.inf
     for s in range(seeds.shape[0]):
-        # A pair that the best match already holds would grow into the same.
+        # A seed that the best match already contains would give the same match.
         if highest > -np.inf and best[seeds[s, 0]] == seeds[s, 1]:
             continue
-        score = _grow(
+        score = _propagate(
             shape,
             expected,
             linear,
@@ -187,37 +227,66 @@ def best_growth(
             buckets,
             cell,
             origin,
-            far,
-            steady,
-            nobody,
+            distance_cost,
+            steady_bonus,
+            none_confirmed,
             seeds[s],
             match,
         )
         if score > highest:
             highest = score
             best[:] = match
-        if highest >= enough:
+        if highest >= sufficient_score:
             break
     return highest
 
 
 @njit(cache=True, nogil=True)
-def agreed_growth(
-    shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, sure, seeds, best
+def agreed_markers(
+    shape,
+    expected,
+    linear,
+    spacing,
+    neighbours,
+    dots,
+    buckets,
+    cell,
+    origin,
+    distance_cost,
+    steady_bonus,
+    confirmed,
+    seeds,
+    best,
 ):
-    """Which markers have the same dot in best (M) and in all matches that grow from seeds and sure ones as well."""
+    """Which markers have the same dot in best (M) and in every match with a similar score from another seed, (M).
+
+    All matches keep the confirmed dots (M), -1 for none.
+    """
     agreed = best >= 0
     match = np.empty(shape.shape[0], np.int64)
     first = np.flatnonzero(best >= 0)[0]
     pair = np.array([first, best[first]])
-    score = _grow(
-        shape, expected, linear, spacing, neighbours, dots, buckets, cell, origin, far, steady, best, pair, match
+    score = _propagate(
+        shape,
+        expected,
+        linear,
+        spacing,
+        neighbours,
+        dots,
+        buckets,
+        cell,
+        origin,
+        distance_cost,
+        steady_bonus,
+        best,
+        pair,
+        match,
     )
     for s in range(seeds.shape[0]):
         marker, dot = seeds[s, 0], seeds[s, 1]
-        if best[marker] == dot or sure[marker] >= 0:
+        if best[marker] == dot or confirmed[marker] >= 0:
             continue
-        other = _grow(
+        other = _propagate(
             shape,
             expected,
             linear,
@@ -227,12 +296,12 @@ def agreed_growth(
             buckets,
             cell,
             origin,
-            far,
-            steady,
-            sure,
+            distance_cost,
+            steady_bonus,
+            confirmed,
             seeds[s],
             match,
         )
-        if other > score - AMBIGUOUS:
+        if other > score - AMBIGUITY_MARGIN:
             agreed &= match == best
     return agreed

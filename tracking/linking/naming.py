@@ -1,166 +1,180 @@
-"""Which dot is which marker of the layout."""
+"""Assigning marker names to the dots of a first frame, by the specimen's layout or by row and column."""
 
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rafl.calibration.camera import Camera
-from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.linking.matching import Pattern, match_shape
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from rafl.calibration.camera import Camera
 from rafl.common.errors import InputError
+from rafl.tracking.linking.layout import MarkerLayout
+from rafl.tracking.linking.matching import MarkerPattern, match_at_rest
 
 Array = NDArray[Any]
 
-FEWEST = 3  # dots that make a pattern
-NEAR = 0.4  # of the local spacing: how far a dot may be from where its neighbours put it
-BEHIND = 0.3  # of the spacing: a marker nearer than this to one before it in the picture is covered
-FAR = 0.05  # of a dot: what one that stands a spacing from its guessed place counts less
-ENOUGH, SURE = 0.9, 1.07  # of all that may match: a score that ends the search, and, times that, ends it at once
-BENDS = np.radians(np.repeat(np.arange(15, 121, 15), 2) * np.tile([1, -1], 8))
-TURNS = np.radians(np.repeat(np.arange(15, 181, 15), 2) * np.tile([1, -1], 12))
-COMPACT = 0.6  # ratio of a layout's width and length, beyond which it may bend about either
+MIN_MATCHED_DOTS = 3
+NEIGHBOUR_GATE = 0.4  # most distance of a dot from its predicted grid position [length of the grid step]
+COVERED_SPACINGS = 0.3  # a marker nearer than this to one in front of it in the image is hidden
+DISTANCE_COST = 0.05  # score lost by a dot one spacing from its position in the tried shape; a match scores 1
+# Scores, relative to the largest possible one: the search ends after a group of shapes with GOOD_SCORE, and at once
+# if the unbent shape reaches CERTAIN_FACTOR times that.
+GOOD_SCORE, CERTAIN_FACTOR = 0.9, 1.07
+TRIED_BENDS = np.radians(np.repeat(np.arange(15, 121, 15), 2) * np.tile([1, -1], 8))
+TRIED_ROTATIONS = np.radians(np.repeat(np.arange(15, 181, 15), 2) * np.tile([1, -1], 12))
+COMPACT_RATIO = 0.6  # layouts with a larger ratio of width to length are tried bent about either axis
 
 
 def visible_markers(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
     """Indices of the markers on the side of the specimen that faces the camera.
 
-    The sides are the flat parts of the layout's convex hull; of a layout in one plane all are seen that do not stand
-    behind another.
+    The sides are the flat parts of the layout's convex hull. If the layout lies in one plane, all markers are visible
+    that no other one covers.
     """
     points = layout.positions
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
-        return _not_behind_others(layout, camera)
+        return _uncovered_markers(layout, camera)
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
     on = np.abs(points @ normals.T + offsets) < 1e-3 * np.ptp(points, axis=0).max()
     facing = normals @ camera.viewing_direction < -0.5
     return np.flatnonzero((on & facing).any(axis=1))
 
 
-def _not_behind_others(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
-    """Indices of the markers that no nearer marker covers."""
-    pixels = camera.ideal(layout.positions)
-    # Of a marker and its image on the far side the second nearest is a true neighbour.
+def _uncovered_markers(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
+    """Indices of the markers that no marker nearer to the camera covers."""
+    pixels = camera.project_undistorted(layout.positions)
+    # The nearest may be the same marker's counterpart on the far side; the second nearest is a true neighbour.
     distances = cKDTree(pixels).query(pixels, min(3, len(pixels)))[0].reshape(len(pixels), -1)
     spacing = float(np.median(distances[:, -1]))
     kept: list[int] = []
     for marker in np.argsort(layout.positions @ camera.viewing_direction):
-        if all(np.linalg.norm(pixels[marker] - pixels[other]) > BEHIND * spacing for other in kept):
+        if all(np.linalg.norm(pixels[marker] - pixels[other]) > COVERED_SPACINGS * spacing for other in kept):
             kept.append(int(marker))
     return np.sort(np.array(kept, dtype=np.int64))
 
 
-def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, what: str) -> list[int]:
+def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, source: str) -> list[int]:
     """The layout marker of each dot (-1 for none).
 
-    The specimen may be bent far and filmed from any side: from many guesses of how it stands, names spread from dot to
-    dot (`rafl.tracking.linking.matching`), and the guess wins that names most dots with the least strain, nearest to where it puts
-    them. Only proper rotations are tried: a mirror image of the layout is no match.
+    The specimen may be strongly bent and filmed from any side. So many shapes and rotations of the layout are tried.
+    From each, a match spreads from dot to dot (`rafl.tracking.linking.matching`). The best match names most dots with
+    the least misfit, nearest to the shape tried. Only proper rotations are tried: a mirror image of the layout is no
+    match.
 
     Args:
         dots: first frame [px], (D, 2).
         layout: of the whole specimen.
         camera: that filmed.
-        what: video, for messages.
+        source: name of the video, for messages.
 
     Raises:
         InputError: fewer than three dots match the layout.
     """
     markers, pixels = visible_markers(layout, camera), camera.undistort(dots)
-    names = _named(pixels, layout, camera, markers)
-    if len(dots) > len(markers):  # marks on the frame; or the skin is hollow, or spheres on stands are seen from behind
-        more = _not_behind_others(layout, camera)
-        wider = _named(pixels, layout, camera, more)
-        named, left = names >= 0, names < 0
-        agreeing = (wider[named] == names[named]).mean() > ENOUGH if named.any() else True
-        if (agreeing or left.sum() > named.sum()) and (wider[left] >= 0).sum() > 0.5 * left.sum():
+    names = _match_layout(pixels, layout, camera, markers)
+    if len(dots) > len(markers):  # static dots, a hollow body, or spheres on stands that are visible from behind
+        more = _uncovered_markers(layout, camera)
+        wider = _match_layout(pixels, layout, camera, more)
+        named, unnamed = names >= 0, names < 0
+        agreeing = (wider[named] == names[named]).mean() > GOOD_SCORE if named.any() else True
+        if (agreeing or unnamed.sum() > named.sum()) and (wider[unnamed] >= 0).sum() > 0.5 * unnamed.sum():
             names, markers = wider, more
     matched = int((names >= 0).sum())
-    if matched < FEWEST:
+    if matched < MIN_MATCHED_DOTS:
         raise InputError(
-            f"{what}: expected dots in the pattern of the specimen's markers, found {matched} of "
+            f"{source}: expected dots in the pattern of the specimen's markers, found {matched} of "
             f"{len(markers)} that match; check --specimen, and that calib.yaml belongs to this set-up"
         )
-    return names.tolist()
+    indices: list[int] = names.tolist()
+    return indices
 
 
-def _named(pixels: Array, layout: MarkerLayout, camera: Camera, markers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Which of some of the layout's markers each dot (D, 2) is, (D), -1 for none."""
-    expected = camera.ideal(layout.positions[markers])
+def _match_layout(pixels: Array, layout: MarkerLayout, camera: Camera, markers: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The layout marker, out of `markers`, of each dot (D, 2); (D), -1 for none."""
+    expected = camera.project_undistorted(layout.positions[markers])
     best: tuple[float, Array] = (-np.inf, np.full(len(markers), -1))
-    enough = ENOUGH * min(len(pixels), len(markers))
-    apart = len(markers) >= FEWEST and np.ptp(expected, axis=0).max() > 1.0
-    for shapes in _guesses(expected) if apart else []:
+    good_score = GOOD_SCORE * min(len(pixels), len(markers))
+    distinct = len(markers) >= MIN_MATCHED_DOTS and np.ptp(expected, axis=0).max() > 1.0
+    for shapes in _candidate_shapes(expected) if distinct else []:
         for shape in shapes:
-            found = match_shape(Pattern.of(shape), pixels, FAR)
+            found = match_at_rest(MarkerPattern.of(shape), pixels, DISTANCE_COST)
             best = max(best, found, key=lambda pair: pair[0])
-            if shape is expected and best[0] > SURE * enough:
+            if shape is expected and best[0] > CERTAIN_FACTOR * good_score:
                 break
-        if best[0] > enough:
+        if best[0] > good_score:
             break
     names = np.full(len(pixels), -1)
     names[best[1][best[1] >= 0]] = markers[best[1] >= 0]
     return names
 
 
-def _guesses(expected: Array) -> Iterator[list[Array]]:
-    """How the markers may stand in the picture, (M, 2) each: first bent more or less, then turned, then both."""
-    bends = [expected, *_bent(expected, BENDS)]
-    yield bends
-    turned = [_turned(expected, turn) for turn in TURNS]
-    yield turned
-    yield [_turned(shape, turn) for turn in TURNS[1::2] for shape in _bent(expected, BENDS[1::3])]
+def _candidate_shapes(expected: Array) -> Iterator[list[Array]]:
+    """Tried positions of the markers in the image, (M, 2) each, in groups: bent; then rotated; then both."""
+    bent = [expected, *_bend(expected, TRIED_BENDS)]
+    yield bent
+    rotated = [_rotate(expected, angle) for angle in TRIED_ROTATIONS]
+    yield rotated
+    yield [_rotate(shape, angle) for angle in TRIED_ROTATIONS[1::2] for shape in _bend(expected, TRIED_BENDS[1::3])]
 
 
-def _turned(places: Array, turn: float) -> Array:
-    middle = places.mean(axis=0)
-    rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    return (places - middle) @ rotation.T + middle
+def _rotate(positions: Array, angle: float) -> Array:
+    """Positions (M, 2) rotated about their mean."""
+    middle = positions.mean(axis=0)
+    rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+    rotated: Array = (positions - middle) @ rotation.T + middle
+    return rotated
 
 
-def _bent(places: Array, angles: Array) -> list[Array]:
-    """Places on a body that is held at either end and bent in the picture, or out of it, by angles at the other."""
-    middle = places.mean(axis=0)
-    _, size, axes = np.linalg.svd(places - middle, full_matrices=False)
+def _bend(positions: Array, angles: Array) -> list[Array]:
+    """Positions (M, 2) on a body clamped at either end and bent, in or out of the image plane.
+
+    `angles` [rad] are the slopes at the free end.
+    """
+    middle = positions.mean(axis=0)
+    _, size, axes = np.linalg.svd(positions - middle, full_matrices=False)
     shapes = []
-    for along in axes[: 2 if size[1] > COMPACT * size[0] else 1]:
+    for along in axes[: 2 if size[1] > COMPACT_RATIO * size[0] else 1]:
         across = np.array([-along[1], along[0]])
-        s, h = (places - middle) @ along, (places - middle) @ across
-        for end, way in ((s.min(), 1.0), (s.max(), -1.0)):
+        s, h = (positions - middle) @ along, (positions - middle) @ across
+        for end, direction in ((s.min(), 1.0), (s.max(), -1.0)):
             length = np.ptp(s)
             u = np.linspace(0.0, 1.0, 101)
-            mine = way * (s - end) / length
+            marker_u = direction * (s - end) / length
             for angle in angles:
-                for form in (2.0 * u - u**2, u):  # a load at the tip, and a pure moment
-                    slope = angle * form
+                for profile in (2.0 * u - u**2, u):  # a load at the tip, and a pure moment
+                    slope = angle * profile
                     steps = np.stack([np.cos(slope), np.sin(slope)], axis=1) * length / (len(u) - 1)
                     line = np.concatenate([[[0.0, 0.0]], np.cumsum(steps[:-1], axis=0)])
-                    x, y, own = (np.interp(mine, u, values) for values in (*line.T, slope))
-                    turning = (x - h * way * np.sin(own), y + h * way * np.cos(own))
-                    upright = (x, y + h * way)  # seen aslant, sections do not seem to turn
-                    out_of_it = (x, h * way)
-                    for forth, side in (turning, upright, out_of_it):
-                        shapes.append(middle + (end + way * forth)[:, None] * along + (way * side)[:, None] * across)
+                    x, y, own = (np.interp(marker_u, u, values) for values in (*line.T, slope))
+                    rotating = (x - h * direction * np.sin(own), y + h * direction * np.cos(own))
+                    upright = (x, y + h * direction)  # in an oblique view, sections do not seem to rotate
+                    out_of_plane = (x, h * direction)
+                    for forth, side in (rotating, upright, out_of_plane):
+                        offset = (end + direction * forth)[:, None] * along
+                        shapes.append(middle + offset + (direction * side)[:, None] * across)
     return shapes
 
 
-def name_by_rows(dots: Array, late: int = 0) -> list[str]:
+def name_by_rows(dots: Array, late_count: int = 0) -> list[str]:
     """Names r1c1, r1c2, ... by row from the top and column from the left.
 
-    Rows may be bent: each dot's neighbours say where the next of its row and column should be. Dots that
-    stand in no such grid are ordered by their height, then from the left. The last `late` dots came into sight after
-    the others: where they stand in no grid with them, they are a row of their own, after the others'.
+    Rows may be bent: each dot's neighbours predict the next dot of its row and column. Dots that form no such grid are
+    ordered by height, then from the left.
+
+    Args:
+        dots: [px], (D, 2).
+        late_count: number of late-detected markers, the last dots. If these form no grid with the others, they get a
+            row of their own after the others'.
     """
-    places = _grid_places(dots)
-    if places is None and late:
-        names = name_by_rows(dots[:-late])
+    indices = _grid_indices(dots)
+    if indices is None and late_count:
+        names = name_by_rows(dots[:-late_count])
         last = max(int(name[1:].split("c")[0]) for name in names)
-        return names + [f"r{last + 1}c{column + 1}" for column in range(late)]
-    if places is None:
+        return names + [f"r{last + 1}c{column + 1}" for column in range(late_count)]
+    if indices is None:
         spacing = float(np.median(cKDTree(dots).query(dots, 2)[0][:, 1]))
         order = np.argsort(dots[:, 1])
         row = np.empty(len(dots), dtype=int)
@@ -168,12 +182,12 @@ def name_by_rows(dots: Array, late: int = 0) -> list[str]:
         column = np.empty(len(dots), dtype=int)
         for members in (np.flatnonzero(row == number) for number in range(row.max() + 1)):
             column[members[np.argsort(dots[members, 0])]] = np.arange(len(members))
-        places = np.stack([row, column], axis=1)
-    return [f"r{row + 1}c{column + 1}" for row, column in places]
+        indices = np.stack([row, column], axis=1)
+    return [f"r{row + 1}c{column + 1}" for row, column in indices]
 
 
-def _grid_places(dots: Array) -> NDArray[np.int64] | None:
-    """Row and column (D, 2) of dots in a grid, however bent; None where they are in none."""
+def _grid_indices(dots: Array) -> NDArray[np.int64] | None:
+    """Row and column (D, 2) of dots in a grid, which may be bent; None if they form no grid."""
     count = min(7, len(dots))
     tree = cKDTree(dots)
     nearest = tree.query(dots, count)[1][:, 1:]
@@ -181,41 +195,45 @@ def _grid_places(dots: Array) -> NDArray[np.int64] | None:
     across, down = _grid_steps(steps)
     if across is None or down is None:
         return None
-    places = np.full((len(dots), 2), np.iinfo(int).min)
-    local = {}
+    indices = np.full((len(dots), 2), np.iinfo(int).min)
+    local_steps = {}
     begin = int(np.argmin(np.linalg.norm(dots - dots.mean(0), axis=1)))
-    places[begin] = 0
-    local[begin] = (across, down)
+    indices[begin] = 0
+    local_steps[begin] = (across, down)
     waiting = [begin]
     while waiting:
         dot = waiting.pop(0)
         for axis, sign in ((1, 1), (1, -1), (0, 1), (0, -1)):
-            step = local[dot][0] if axis == 1 else local[dot][1]
+            step = local_steps[dot][0] if axis == 1 else local_steps[dot][1]
             distance, other = tree.query(dots[dot] + sign * step)
-            if distance > NEAR * np.linalg.norm(step):
+            if distance > NEIGHBOUR_GATE * np.linalg.norm(step):
                 continue
-            place = places[dot].copy()
-            place[axis] += sign
-            if other in local:
-                if (places[other] != place).any():
+            index = indices[dot].copy()
+            index[axis] += sign
+            if other in local_steps:
+                if (indices[other] != index).any():
                     return None
                 continue
-            places[other] = place
+            indices[other] = index
             found = sign * (dots[other] - dots[dot])
-            # The grid turns from dot to dot: half of what this step says is believed.
+            # The grid turns from dot to dot: average the former step and the one found.
             turned = 0.5 * (step + found)
             angle = np.arctan2(turned[1], turned[0]) - np.arctan2(step[1], step[0])
-            spin = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-            rest = spin @ (local[dot][1] if axis == 1 else local[dot][0])
-            local[other] = (turned, rest) if axis == 1 else (rest, turned)
+            rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+            other_step = rotation @ (local_steps[dot][1] if axis == 1 else local_steps[dot][0])
+            local_steps[other] = (turned, other_step) if axis == 1 else (other_step, turned)
             waiting.append(other)
-    if len(local) < len(dots) or len(np.unique(places, axis=0)) < len(dots):
+    if len(local_steps) < len(dots) or len(np.unique(indices, axis=0)) < len(dots):
         return None
-    return places - places.min(axis=0)
+    grid: NDArray[np.int64] = indices - indices.min(axis=0)
+    return grid
 
 
 def _grid_steps(steps: Array) -> tuple[Array | None, Array | None]:
-    """The most frequent short steps along a row, to the right, and along a column, downwards."""
+    """The typical step along a row, to the right, and along a column, downwards [px]; None if there are too few.
+
+    `steps` (N, 2) are those from every dot to its nearest ones. The median of the shortest ones is taken.
+    """
     result: list[Array | None] = []
     for axis in (0, 1):
         along = steps[np.abs(steps[:, axis]) > 1.2 * np.abs(steps[:, 1 - axis])]

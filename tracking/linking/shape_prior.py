@@ -1,10 +1,16 @@
-"""The shapes a body was seen in, by which its markers out of sight are placed.
+"""A Gaussian prior over the body's shapes. It predicts the markers that are out of sight from those in sight.
 
-A body swings through the same shapes again and again. What of it is in sight says which of them it is in, and so where
-the rest of it is; a shape never seen before is at least smooth. In numbers: the markers' places are drawn from a normal
-distribution about the mean of the shapes that are nearest to what is in sight, in which those differ as these do and,
-the less the more shapes there were, as bodies that move, turn, bend and stretch smoothly; the markers in sight
-condition it.
+A moving body takes similar shapes again and again. The visible markers show which of the earlier shapes the present
+one resembles, and so where the hidden markers are. A shape never seen before is at least smooth. The markers' positions
+x (2 M values) are modelled as normally distributed, x = mean + W a + e:
+
+- The mean is that of the earlier shapes nearest to the visible markers.
+- The columns of W are deformation modes, scaled so that the amplitudes a are standard normal. Some are the differences
+  between those nearest shapes. The others are generic: translation, rotation, bending and smooth stretching. Their
+  scale falls as the number of known shapes grows.
+- e is independent noise.
+
+Conditioning on the visible markers gives the position and standard deviation of the hidden ones.
 """
 
 from typing import Any, NamedTuple
@@ -16,181 +22,199 @@ from scipy.spatial import cKDTree
 
 Array = NDArray[Any]
 
-MOST = 128  # shapes kept; of longer recordings every second, fourth, ... frame's
-NEAREST = 8  # of them, about which another may lie
-WIDER = 4.0  # times their differences: so much is nothing surprising
-SMOOTH, SMOOTHEST = 32, 1e-8  # ways of bending smoothly: how many, and their least share of the largest one's variance
-AROUND = 4  # nearest markers, the farthest of which tells how far apart markers are on the whole: the unit below
-MOVING, BENDS = 5.0, 6  # standard deviation of moving and turning, much less of bending; of how many degrees
-STRETCHING, LENGTH = 0.4, 5.0  # standard deviation of stretching and shearing, and over what it is smooth
-FADED = 5.0, 10.0  # shapes after which moving and turning, and all else, are half as likely
-NEW = 0.1  # from the last shape kept that any marker must have moved, for another
-EXACT = 0.01  # standard deviation of what neither holds
-ABOUT = 8.0  # side of the square in which a dot may be anywhere
+# The unit of length below: the median distance from a marker to its UNIT_NEIGHBOUR-th nearest one.
+UNIT_NEIGHBOUR = 4
+MAX_SHAPES = 128  # shapes kept; a longer recording keeps only every second, fourth, ... of them
+NEAREST_SHAPES = 8  # shapes whose mean and differences give the local model
+SHAPE_MODE_SCALE = 4.0  # factor on the differences between the nearest shapes: an extrapolation this far is normal
+MAX_STRETCH_MODES = 32
+MIN_VARIANCE_RATIO = 1e-8  # of a stretching mode, relative to the largest
+RIGID_SIGMA = 5.0  # standard deviation of translation and rotation [units]; that of bending is much smaller
+BENDING_DEGREES = 6  # polynomial degrees, from 0, of the bending modes
+STRETCH_SIGMA, STRETCH_LENGTH = 0.4, 5.0  # standard deviation and correlation length of stretching and shear [units]
+RIGID_HALVING_SHAPES, OTHER_HALVING_SHAPES = 5.0, 10.0  # known shapes after which a generic mode's scale has halved
+MIN_CHANGE = 0.1  # displacement of any marker since the last kept shape that makes a new one [units]
+NOISE_SIGMA = 0.01  # standard deviation of e [units]
+CLUTTER_SIDE = 8.0  # side of the square in which an arbitrary dot may lie [units]
 
 
-class Belief(NamedTuple):
-    """Where markers are thought to be.
+class PredictedPosition(NamedTuple):
+    """Predicted positions of the markers.
 
     Attributes:
-        place: [px], (M, 2).
-        sigma: standard deviation of that along x and along y [px], (M); infinite where nothing is known.
+        position: [px], (M, 2).
+        sigma: standard deviation along x and along y [px], (M); infinite where nothing is known.
     """
 
-    place: Array
+    position: Array
     sigma: Array
 
 
-class Memory:
-    """Shapes from the recording so far, evenly spread over it."""
+class ShapePrior:
+    """The prior, with shapes spread evenly over the recording so far."""
 
     def __init__(self, rest: Array) -> None:
-        """Of markers at rest at these places [px], (M, 2)."""
+        """Start without any shape; `rest` are the markers' positions at rest [px], (M, 2)."""
         self._rest = rest
-        distance = cKDTree(rest).query(rest, min(AROUND + 1, len(rest)))[0]
+        distance = cKDTree(rest).query(rest, min(UNIT_NEIGHBOUR + 1, len(rest)))[0]
         self._unit = float(np.median(distance[:, -1]))
-        self._error = EXACT * self._unit
-        turning, stretching = self._turning(), self._stretching()
-        self._any = np.concatenate([turning, stretching], axis=1)
-        self._fading = np.repeat([FADED[0], FADED[1]], [4, self._any.shape[1] - 4])
-        self._shapes = np.empty((0, 2 * len(rest)))  # ways from rest
-        self._every, self._added = 1, 0
-        self._known = np.zeros(len(rest))  # shapes in which each was seen
+        self._noise = NOISE_SIGMA * self._unit
+        bending, stretching = self._bending_modes(), self._stretching_modes()
+        self._generic_modes = np.concatenate([bending, stretching], axis=1)
+        halving = [RIGID_HALVING_SHAPES, OTHER_HALVING_SHAPES]
+        self._halving_shapes = np.repeat(halving, [4, self._generic_modes.shape[1] - 4])
+        self._shapes = np.empty((0, 2 * len(rest)))  # displacements from rest
+        self._keep_every, self._added = 1, 0
+        self._times_seen = np.zeros(len(rest))  # shapes in which each marker was seen
 
     def __len__(self) -> int:
-        """How many shapes."""
+        """Number of shapes kept."""
         return len(self._shapes)
 
-    def _turning(self) -> Array:
-        """Ways to move, turn, grow and bend that leave rows square to columns, as likely as they are [px], (2 M, K).
+    def _bending_modes(self) -> Array:
+        """Modes of translation, rotation, scaling and bending, times their standard deviations [px], (2 M, K).
 
-        Complex Chebyshev polynomials along the body's length: the real part of their values is the way along it, the
-        imaginary part that across it.
+        They are conformal: rows of markers stay perpendicular to columns. Each is a Chebyshev polynomial of the complex
+        position along (real part) and across (imaginary part) the body's long axis.
         """
-        arm = self._rest - self._rest.mean(axis=0)
-        axis = complex(*np.linalg.eigh(arm.T @ arm)[1][:, -1])
-        place = (arm[:, 0] + 1j * arm[:, 1]) * np.conj(axis)
-        half = max(float(np.abs(place.real).max()), self._unit)
-        ways = []
-        for degree in range(BENDS):
-            likely = MOVING * self._unit * max(1.0, half / (3.0 * self._unit)) ** (degree == 1) / max(degree, 1) ** 4
-            bent = np.polynomial.chebyshev.chebval(place / half, np.eye(BENDS)[degree])
-            ways += [likely * axis * bent, likely * axis * 1j * bent]
-        return np.stack([np.stack([way.real, way.imag], axis=1).ravel() for way in ways], axis=1)
+        centred = self._rest - self._rest.mean(axis=0)
+        axis = complex(*np.linalg.eigh(centred.T @ centred)[1][:, -1])
+        position = (centred[:, 0] + 1j * centred[:, 1]) * np.conj(axis)
+        half = max(float(np.abs(position.real).max()), self._unit)
+        modes = []
+        for degree in range(BENDING_DEGREES):
+            scale = (
+                RIGID_SIGMA * self._unit * max(1.0, half / (3.0 * self._unit)) ** (degree == 1) / max(degree, 1) ** 4
+            )
+            polynomial = np.polynomial.chebyshev.chebval(position / half, np.eye(BENDING_DEGREES)[degree])
+            modes += [scale * axis * polynomial, scale * axis * 1j * polynomial]
+        return np.stack([np.stack([mode.real, mode.imag], axis=1).ravel() for mode in modes], axis=1)
 
-    def _stretching(self) -> Array:
-        """Ways to stretch and shear smoothly, as likely as they are [px], (2 M, K)."""
+    def _stretching_modes(self) -> Array:
+        """Modes of smooth stretching and shear, times their standard deviations [px], (2 M, K)."""
         square = ((self._rest[:, None] - self._rest[None]) ** 2).sum(axis=2)
-        variance, ways = np.linalg.eigh(np.exp(-0.5 * square / (LENGTH * self._unit) ** 2))
-        variance, ways = variance[-SMOOTH:], ways[:, -SMOOTH:]
-        large = variance > SMOOTHEST * variance[-1]
-        return np.kron(STRETCHING * self._unit * ways[:, large] * np.sqrt(variance[large]), np.eye(2))
+        variance, modes = np.linalg.eigh(np.exp(-0.5 * square / (STRETCH_LENGTH * self._unit) ** 2))
+        variance, modes = variance[-MAX_STRETCH_MODES:], modes[:, -MAX_STRETCH_MODES:]
+        large = variance > MIN_VARIANCE_RATIO * variance[-1]
+        scaled: Array = np.kron(STRETCH_SIGMA * self._unit * modes[:, large] * np.sqrt(variance[large]), np.eye(2))
+        return scaled
 
-    def add(self, place: Array, seen: NDArray[np.bool_]) -> None:
-        """The markers' places [px], (M, 2), in the next frame, seen (M) or believed."""
-        away = place - self._rest
-        if len(self._shapes) and np.abs(away.ravel() - self._shapes[-1]).max() < NEW * self._unit:
+    def add_shape(self, position: Array, seen: NDArray[np.bool_]) -> None:
+        """Add the shape of the next frame, unless it hardly differs from the last one.
+
+        Args:
+            position: of all markers, measured or predicted [px], (M, 2).
+            seen: which of them were measured, (M).
+        """
+        displacement = position - self._rest
+        if len(self._shapes) and np.abs(displacement.ravel() - self._shapes[-1]).max() < MIN_CHANGE * self._unit:
             return
         self._added += 1
-        self._known += seen
-        if self._added % self._every:
+        self._times_seen += seen
+        if self._added % self._keep_every:
             return
-        if len(self._shapes) == MOST:
+        if len(self._shapes) == MAX_SHAPES:
             self._shapes = self._shapes[1::2]
-            self._every *= 2
-        self._shapes = np.concatenate([self._shapes, away.reshape(1, -1)])
+            self._keep_every *= 2
+        self._shapes = np.concatenate([self._shapes, displacement.reshape(1, -1)])
 
-    def join(self, rest: Array) -> "Memory":
-        """The same with one more marker, by its place at rest [px], (2)."""
-        joined = Memory(np.concatenate([self._rest, rest[None]]))
+    def with_marker(self, rest: Array) -> "ShapePrior":
+        """The same prior with one more marker, at rest at `rest` [px], (2); its position in each shape is predicted."""
+        joined = ShapePrior(np.concatenate([self._rest, rest[None]]))
         known = np.arange(len(joined._rest)) < len(self._rest)
         for shape in self._shapes:
-            place = joined._rest.copy()
-            place[:-1] += shape.reshape(-1, 2)
-            away = joined.carried(place, known).place - joined._rest
-            joined._shapes = np.concatenate([joined._shapes, away.reshape(1, -1)])
-        joined._every, joined._added, joined._known = self._every, self._added, np.append(self._known, 0.0)
+            position = joined._rest.copy()
+            position[:-1] += shape.reshape(-1, 2)
+            displacement = joined.predict(position, known).position - joined._rest
+            joined._shapes = np.concatenate([joined._shapes, displacement.reshape(1, -1)])
+        joined._keep_every, joined._added = self._keep_every, self._added
+        joined._times_seen = np.append(self._times_seen, 0.0)
         return joined
 
-    def carried(self, position: Array, known: NDArray[np.bool_], guess: Belief | None = None) -> Belief:
-        """Where the markers are.
+    def predict(
+        self, position: Array, known: NDArray[np.bool_], guess: PredictedPosition | None = None
+    ) -> PredictedPosition:
+        """Predict the unknown markers from the known ones.
 
         Args:
             position: of the known markers [px], (M, 2).
             known: which these are, (M).
-            guess: of the others, by their own motion. What it misses of one it may miss of all.
+            guess: of the other markers, from their own motion. Its errors may be common to all of them.
 
         Returns:
-            The known ones at their position, with a sigma of 0.
+            All markers. The known ones keep their position and have a sigma of 0.
         """
         if known.all():
-            return Belief(position.copy(), np.zeros(len(known)))
-        place, weight = np.where(known[:, None], position, self._rest), known.astype(float)
+            return PredictedPosition(position.copy(), np.zeros(len(known)))
+        predicted, weight = np.where(known[:, None], position, self._rest), known.astype(float)
         if guess is not None:
-            unsure = (~known).sum() * guess.sigma**2
-            weight = np.where(known, 1.0, self._error**2 / (self._error**2 + unsure))  # as if of a known one's error
-            place = np.where(known[:, None] | (weight == 0.0)[:, None], place, guess.place)
-        told, hidden = np.repeat(weight, 2), np.repeat(~known, 2)
-        middle, ways = self._about(place, told, ~known)
-        own = place.ravel() - middle
-        factor, amounts = self._fitted(own, told, ways)
-        left = own - ways @ amounts
-        surprise = ((told * left**2).sum() / self._error**2 + (amounts**2).sum()) / max(told.sum(), 1.0)
-        cone = self._error * solve_triangular(factor, ways[hidden].T, lower=True)
-        square = 0.5 * (cone**2).sum(axis=0).reshape(-1, 2).sum(axis=1)
-        place[~known] = (middle + ways @ amounts).reshape(-1, 2)[~known]
+            variance = (~known).sum() * guess.sigma**2
+            weight = np.where(known, 1.0, self._noise**2 / (self._noise**2 + variance))  # relative to a known marker
+            predicted = np.where(known[:, None] | (weight == 0.0)[:, None], predicted, guess.position)
+        weights, hidden = np.repeat(weight, 2), np.repeat(~known, 2)
+        mean, modes = self._local_model(predicted, weights, ~known)
+        deviation = predicted.ravel() - mean
+        factor, amplitudes = self._fit(deviation, weights, modes)
+        residual = deviation - modes @ amplitudes
+        mean_square = ((weights * residual**2).sum() / self._noise**2 + (amplitudes**2).sum()) / max(weights.sum(), 1.0)
+        spread = self._noise * solve_triangular(factor, modes[hidden].T, lower=True)
+        variance = 0.5 * (spread**2).sum(axis=0).reshape(-1, 2).sum(axis=1)
+        predicted[~known] = (mean + modes @ amplitudes).reshape(-1, 2)[~known]
         sigma = np.zeros(len(known))
-        sigma[~known] = np.sqrt(max(surprise, 1.0) * square + self._error**2)
-        return Belief(place, sigma)
+        sigma[~known] = np.sqrt(max(mean_square, 1.0) * variance + self._noise**2)
+        return PredictedPosition(predicted, sigma)
 
-    def smoothed(self, position: Array, known: NDArray[np.bool_]) -> Array:
-        """Where markers are likely (M, 2), known ones (M) too, by the known ones' positions [px], (M, 2)."""
-        told = np.repeat(known.astype(float), 2)
-        middle, ways = self._about(position, told, known)
-        return (middle + ways @ self._fitted(position.ravel() - middle, told, ways)[1]).reshape(-1, 2)
+    def smooth(self, position: Array, known: NDArray[np.bool_]) -> Array:
+        """The likeliest positions of all markers (M, 2), the known ones (M) included, given `position` [px], (M, 2)."""
+        weights = np.repeat(known.astype(float), 2)
+        mean, modes = self._local_model(position, weights, known)
+        smoothed: Array = (mean + modes @ self._fit(position.ravel() - mean, weights, modes)[1]).reshape(-1, 2)
+        return smoothed
 
     def evidence(self, position: Array, known: NDArray[np.bool_]) -> tuple[float, float]:
-        """How likely places [px], (M, 2), of the known markers (M) are, and how surprising.
+        """How well the prior explains positions [px], (M, 2), of the known markers (M).
 
         Returns:
-            The logarithm of their density beside that of dots anywhere about the body, and the mean square of what
-            should be standard normal numbers: 1, or less where they are explained with amounts to spare.
+            The logarithm of the positions' density relative to that of arbitrary dots near the body, and the mean
+            square of the normalised residuals and amplitudes. The latter is about 1 or less if the prior explains them.
         """
-        told = np.repeat(known.astype(float), 2)
-        middle, ways = self._about(position, told, known)
-        own = position.ravel() - middle
-        factor, amounts = self._fitted(own, told, ways)
-        square = (told * (own - ways @ amounts) ** 2).sum() / self._error**2 + (amounts**2).sum()
-        count = told.sum()
-        volume = np.log(np.diag(factor) / self._error).sum() + count * np.log(self._error)
-        return float(count * np.log(ABOUT * self._unit) - 0.5 * square - volume), float(square / max(count, 1.0))
+        weights = np.repeat(known.astype(float), 2)
+        mean, modes = self._local_model(position, weights, known)
+        deviation = position.ravel() - mean
+        factor, amplitudes = self._fit(deviation, weights, modes)
+        square = (weights * (deviation - modes @ amplitudes) ** 2).sum() / self._noise**2 + (amplitudes**2).sum()
+        count = weights.sum()
+        log_volume = np.log(np.diag(factor) / self._noise).sum() + count * np.log(self._noise)
+        log_ratio = count * np.log(CLUTTER_SIDE * self._unit) - 0.5 * square - log_volume
+        return float(log_ratio), float(square / max(count, 1.0))
 
-    def shapes(self, most: int) -> list[Array]:
-        """Up to so many of the shapes, evenly spread: places [px], (M, 2)."""
-        chosen = np.unique(np.linspace(0, len(self._shapes) - 1, min(most, len(self._shapes))).astype(int))
+    def sample_shapes(self, count: int) -> list[Array]:
+        """Up to `count` of the shapes, evenly spread: positions [px], (M, 2)."""
+        chosen = np.unique(np.linspace(0, len(self._shapes) - 1, min(count, len(self._shapes))).astype(int))
         return [self._rest + self._shapes[k].reshape(-1, 2) for k in chosen]
 
-    def _about(self, place: Array, told: Array, asked: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Where the body may be, (2 M), and its ways from there, as long as they are likely, (2 M, K) [px].
+    def _local_model(self, position: Array, weights: Array, queried: NDArray[np.bool_]) -> tuple[Array, Array]:
+        """The mean (2 M) and the scaled modes (2 M, K) of the prior near the given positions [px].
 
         Args:
-            place: of the markers [px], (M, 2).
-            told: how much the coordinates of these count, (2 M).
-            asked: the markers of whom it is to be known, (M).
+            position: of the markers [px], (M, 2).
+            weights: of their coordinates, (2 M).
+            queried: the markers whose position is sought, (M). The generic modes count for less the more shapes
+                have shown all of these.
         """
-        known = self._known[asked].min(initial=self._added)
-        any_ways = self._any * (self._fading / (self._fading + known))
+        times_seen = self._times_seen[queried].min(initial=self._added)
+        generic_modes = self._generic_modes * (self._halving_shapes / (self._halving_shapes + times_seen))
         if not len(self._shapes):
-            return self._rest.ravel(), any_ways
-        away = (self._shapes - (place - self._rest).ravel()) ** 2 @ told
-        near = self._shapes[np.argsort(away)[:NEAREST]]
-        middle = near.mean(axis=0)
-        seen_ways = WIDER / np.sqrt(len(near)) * (near - middle).T
-        return self._rest.ravel() + middle, np.concatenate([any_ways, seen_ways], axis=1)
+            return self._rest.ravel(), generic_modes
+        distance = (self._shapes - (position - self._rest).ravel()) ** 2 @ weights
+        nearest = self._shapes[np.argsort(distance)[:NEAREST_SHAPES]]
+        mean = nearest.mean(axis=0)
+        shape_modes = SHAPE_MODE_SCALE / np.sqrt(len(nearest)) * (nearest - mean).T
+        return self._rest.ravel() + mean, np.concatenate([generic_modes, shape_modes], axis=1)
 
-    def _fitted(self, own: Array, told: Array, ways: Array) -> tuple[Array, Array]:
-        """The Cholesky factor of the normal equations, (K, K), and the amounts of the ways that give the own, (K)."""
-        heavy = ways * told[:, None]
-        moment = ways.T @ heavy + self._error**2 * np.eye(ways.shape[1])
-        factor = np.linalg.cholesky(moment)
-        return factor, cho_solve((factor, True), heavy.T @ own)
+    def _fit(self, deviation: Array, weights: Array, modes: Array) -> tuple[Array, Array]:
+        """Cholesky factor (K, K) of the regularised normal equations, and the modes' amplitudes (K) that solve them."""
+        weighted = modes * weights[:, None]
+        normal = modes.T @ weighted + self._noise**2 * np.eye(modes.shape[1])
+        factor = np.linalg.cholesky(normal)
+        return factor, cho_solve((factor, True), weighted.T @ deviation)

@@ -1,6 +1,6 @@
-"""Dots that keep still while the body beside them moves: marks on the frame, screws, letters' holes.
+"""Dots that stay still while the body beside them moves, such as marks on the frame, screws or holes in letters.
 
-They look like markers, but where the body is they do not tell.
+They look like markers but carry no information about the body.
 """
 
 from typing import Any
@@ -8,58 +8,70 @@ from typing import Any
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from rafl.tracking.linking.matching import Pattern
-from rafl.tracking.linking.shape_prior import Memory
+
+from rafl.tracking.linking.matching import MarkerPattern
+from rafl.tracking.linking.shape_prior import ShapePrior
 
 Array = NDArray[Any]
 
-STILL = 0.05  # spacings: who never was farther from its first place may be a mark
-LEFT_BEHIND = 0.5  # spacings: who keeps still so far from where the others would carry it is one
-BEYOND_DOUBT = 4.0  # standard deviations: likewise
-FARTHER = 1.3  # times as far as at the last look the body must have gone, for another look
-FEWEST = 4  # moving markers that carry others
+MAX_STATIC_DISPLACEMENT = 0.05  # a static dot was never farther than this from its first position [spacings]
+# A still dot is static if the moving markers predict it this far from its first position:
+MIN_DEVIATION_SPACINGS = 0.5
+MIN_DEVIATION_SIGMAS = 4.0  # standard deviations of the prediction
+RECHECK_RATIO = 1.3  # growth of the largest displacement of any marker after which the dots are checked again
+MIN_MOVING_MARKERS = 4  # needed to predict the still ones
 
 
-class Marks:
-    """Which of a recording's markers are marks, as far as the motion has shown.
+class StaticDots:
+    """The static dots among a recording's markers.
 
     Attributes:
-        known: (M).
+        mask: the markers found to be static so far, (M).
     """
 
     def __init__(self, count: int) -> None:
-        self.known = np.zeros(count, bool)
-        self._way = np.zeros(count)  # the farthest that each was from its first place [spacings]
-        self._looked = LEFT_BEHIND / FARTHER  # how far the body had gone then [spacings]
+        """Start with `count` markers, none of them static."""
+        self.mask = np.zeros(count, bool)
+        self._max_displacement = np.zeros(count)  # of each marker from its first position [spacings]
+        self._checked_displacement = MIN_DEVIATION_SPACINGS / RECHECK_RATIO  # largest one at the last check [spacings]
 
-    def look(self, place: Array, seen: NDArray[np.bool_], pattern: Pattern) -> None:
-        """At the places [px], (M, 2), of the markers seen (M) in the next picture."""
-        farthest = _go(place, seen, pattern.rest, pattern.spacing, self._way)
-        if farthest < FARTHER * self._looked and not self.known.any():
+    def update(self, positions: Array, seen: NDArray[np.bool_], pattern: MarkerPattern) -> None:
+        """Take the next frame into account.
+
+        Args:
+            positions: of the markers [px], (M, 2).
+            seen: which of them were measured, (M).
+            pattern: the markers at rest.
+        """
+        farthest = _update_displacement(positions, seen, pattern.rest, pattern.spacing, self._max_displacement)
+        if farthest < RECHECK_RATIO * self._checked_displacement and not self.mask.any():
             return
-        still = self._way < STILL
-        self.known &= still
-        if farthest < FARTHER * self._looked:
+        still = self._max_displacement < MAX_STATIC_DISPLACEMENT
+        self.mask &= still
+        if farthest < RECHECK_RATIO * self._checked_displacement:
             return
-        self._looked = farthest
+        self._checked_displacement = farthest
         still, moving = seen & still, seen & ~still
-        if still.any() and moving.sum() >= FEWEST:
-            belief = Memory(pattern.rest).carried(place, moving)
-            left = np.hypot(*(belief.place - pattern.rest).T)
-            self.known |= still & (left > LEFT_BEHIND * pattern.spacing) & (left > BEYOND_DOUBT * belief.sigma)
+        if still.any() and moving.sum() >= MIN_MOVING_MARKERS:
+            predicted = ShapePrior(pattern.rest).predict(positions, moving)
+            deviation = np.hypot(*(predicted.position - pattern.rest).T)
+            far = deviation > MIN_DEVIATION_SPACINGS * pattern.spacing
+            self.mask |= still & far & (deviation > MIN_DEVIATION_SIGMAS * predicted.sigma)
 
-    def join(self) -> None:
-        """One more marker, which is none."""
-        self.known, self._way = np.append(self.known, False), np.append(self._way, 1.0)
+    def add_marker(self) -> None:
+        """Add a marker that is not static."""
+        self.mask, self._max_displacement = np.append(self.mask, False), np.append(self._max_displacement, 1.0)
 
 
 @njit(cache=True)
-def _go(place, seen, rest, spacing, way):
-    """The farthest that a marker is from its first place [spacings]; way (M) becomes at least what each one's is."""
+def _update_displacement(
+    positions: Array, seen: NDArray[np.bool_], rest: Array, spacing: Array, max_displacement: Array
+) -> float:
+    """The largest displacement of a visible marker from rest [spacings]. Updates each marker's largest one (M)."""
     farthest = 0.0
     for k in range(len(seen)):
         if seen[k]:
-            away = np.hypot(place[k, 0] - rest[k, 0], place[k, 1] - rest[k, 1]) / spacing[k]
-            way[k] = max(way[k], away)
-            farthest = max(farthest, away)
+            displacement = np.hypot(positions[k, 0] - rest[k, 0], positions[k, 1] - rest[k, 1]) / spacing[k]
+            max_displacement[k] = max(max_displacement[k], displacement)
+            farthest = max(farthest, displacement)
     return farthest

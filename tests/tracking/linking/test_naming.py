@@ -1,43 +1,43 @@
 import numpy as np
 import pytest
-from rafl.calibration.camera import OrthographicCamera
-from rafl.tracking.linking.layout import MarkerLayout, read_layout
-from rafl.tracking.linking.naming import name_by_layout, name_by_rows, visible_markers
 from scipy.spatial.transform import Rotation
 from support import ROOT
 
+from rafl.calibration.camera import OrthographicCamera
 from rafl.common.errors import InputError
+from rafl.tracking.linking.layout import MarkerLayout, read_layout
+from rafl.tracking.linking.naming import name_by_layout, name_by_rows, visible_markers
 
 CAMERA = OrthographicCamera(
     image_size=(1280, 720), scale=(9000.0, 9000.0), rotation_vector=(np.pi / 2, 0.0, 0.0), offset=(150.0, 400.0)
 )
 
 
-def two_sided(off: float = 0.0) -> MarkerLayout:
-    """16 markers on each side face of a beam, the far side's `off` m nearer to the tip."""
-    names, places = [], []
+def two_sided(shift: float = 0.0) -> MarkerLayout:
+    """16 markers on each side face of a beam. Those of the far side are shifted by `shift` [m] towards the tip."""
+    names, positions = [], []
     for side, y in (("L", 0.0), ("R", 0.03)):
         for row, z in enumerate((0.02, 0.01)):
             for column in range(8):
                 names.append(f"{side}{row}{column}")
-                places.append((0.010 + 0.012 * column + (off if side == "R" else 0.0), y, z))
-    return MarkerLayout(tuple(names), np.array(places))
+                positions.append((0.010 + 0.012 * column + (shift if side == "R" else 0.0), y, z))
+    return MarkerLayout(tuple(names), np.array(positions))
 
 
 LAYOUT = two_sided()
 
 
-def filmed(turn_deg: float = 0.0, bend: float = 0.0, shift: float = 0.0) -> np.ndarray:
-    """The left side's dots in the picture, bent down by `bend` m at the tip, then turned."""
-    places = LAYOUT.positions[:16].copy()
-    places[:, 2] -= bend * (places[:, 0] / 0.1) ** 2
-    places[:, 0] += shift
-    centre = places.mean(0)
-    turn = Rotation.from_rotvec([0, np.radians(turn_deg), 0]).as_matrix()
-    return CAMERA.project((places - centre) @ turn.T + centre)
+def project_left_side(turn_deg: float = 0.0, bend: float = 0.0, shift: float = 0.0) -> np.ndarray:
+    """The left side's dots in the image [px], bent down by `bend` [m] at the tip, then rotated."""
+    positions = LAYOUT.positions[:16].copy()
+    positions[:, 2] -= bend * (positions[:, 0] / 0.1) ** 2
+    positions[:, 0] += shift
+    centre = positions.mean(0)
+    rotation = Rotation.from_rotvec([0, np.radians(turn_deg), 0]).as_matrix()
+    return CAMERA.project((positions - centre) @ rotation.T + centre)
 
 
-def test_only_the_near_side_is_seen() -> None:
+def test_only_the_near_side_is_visible() -> None:
     assert CAMERA.viewing_direction == pytest.approx([0, 1, 0])
     assert visible_markers(LAYOUT, CAMERA).tolist() == list(range(16))
     one_plane = MarkerLayout(LAYOUT.names[:16], LAYOUT.positions[:16])
@@ -47,112 +47,114 @@ def test_only_the_near_side_is_seen() -> None:
 @pytest.mark.parametrize("name", ["fishtail-crude", "fishtail-fine"])
 @pytest.mark.parametrize("bend", [0.0, 0.03])
 def test_a_single_row_on_each_edge_of_a_hollow_flat_body(name: str, bend: float, random: np.random.Generator) -> None:
-    """Fish-tails: every dot of the far edge is behind one of the near edge, and the near edge is no flat side."""
+    """Fish-tails: a dot of the near edge hides each dot of the far edge, and the near edge is no flat side."""
     layout = read_layout(ROOT / "datasets" / "specimens" / f"{name}.yaml")
     near = [k for k, marker in enumerate(layout.names) if marker.startswith("L")]
     assert visible_markers(layout, CAMERA).tolist() == near
-    places = layout.positions[near].copy()
-    places[:, 2] -= bend * (places[:, 0] / 0.1) ** 2
+    positions = layout.positions[near].copy()
+    positions[:, 2] -= bend * (positions[:, 0] / 0.1) ** 2
     mixed = random.permutation(len(near))
-    assert name_by_layout(CAMERA.project(places)[mixed], layout, CAMERA, "a video") == mixed.tolist()
+    assert name_by_layout(CAMERA.project(positions)[mixed], layout, CAMERA, "a video") == mixed.tolist()
 
 
 @pytest.mark.parametrize(
     ("turn", "bend", "shift"),
     [(0, 0, 0), (0, 0.05, 0), (5, 0.03, 0.004), (90, 0.0, 0.0), (-150, 0.01, 0.0), (0, -0.06, 0.0)],
 )
-def test_dots_in_any_order_get_their_names(turn: float, bend: float, shift: float, random: np.random.Generator) -> None:
-    dots = filmed(turn, bend, shift)
+def test_dots_in_any_order_are_named(turn: float, bend: float, shift: float, random: np.random.Generator) -> None:
+    dots = project_left_side(turn, bend, shift)
     mixed = random.permutation(16)
     names = name_by_layout(dots[mixed], LAYOUT, CAMERA, "a video")
     if abs(turn) < 90:
         assert names == mixed.tolist()
-    else:  # a two-row grid looks the same upside down; each name still occurs once
+    else:  # a grid of two rows looks the same upside down; each name still occurs once
         assert sorted(names) == list(range(16))
 
 
-def hanging(places: np.ndarray, slope: float) -> np.ndarray:
-    """Bent without stretching, the slope growing as in a cantilever to `slope` rad at the tip."""
-    s = np.linspace(0.0, 1.02 * places[:, 0].max(), 500)
+def bend_cantilever(positions: np.ndarray, slope: float) -> np.ndarray:
+    """Bent without stretching, with a cantilever's slope, which is `slope` [rad] at the tip."""
+    s = np.linspace(0.0, 1.02 * positions[:, 0].max(), 500)
     angle = slope * (2.0 * s / s[-1] - (s / s[-1]) ** 2)
     step = s[1]
     line = np.cumsum(np.stack([np.cos(angle), -np.sin(angle)]) * step, axis=1) - step * np.array([[1.0], [0.0]])
-    middle = 0.5 * (places[:, 2].max() + places[:, 2].min())
-    x, z, own = (np.interp(places[:, 0], s, values) for values in (*line, angle))
-    bent = places.copy()
-    bent[:, 0] = x + (places[:, 2] - middle) * np.sin(own)
-    bent[:, 2] = middle + z + (places[:, 2] - middle) * np.cos(own)
+    middle = 0.5 * (positions[:, 2].max() + positions[:, 2].min())
+    x, z, own = (np.interp(positions[:, 0], s, values) for values in (*line, angle))
+    bent = positions.copy()
+    bent[:, 0] = x + (positions[:, 2] - middle) * np.sin(own)
+    bent[:, 2] = middle + z + (positions[:, 2] - middle) * np.cos(own)
     return bent
 
 
 @pytest.mark.parametrize("slope_deg", [-80, -60, 35, 50, 65, 80])
 @pytest.mark.parametrize("name", ["canonical", "thinner", "longer", "shorter"])
-@pytest.mark.parametrize("lost", [0, 2])
-def test_far_bent_beams_get_their_names(name: str, slope_deg: float, lost: int) -> None:
-    """Rows stand nearer than columns, and the tip hangs below the clamp."""
+@pytest.mark.parametrize("hidden", [0, 2])
+def test_strongly_bent_beams_are_named(name: str, slope_deg: float, hidden: int) -> None:
+    """Rows are closer together than columns, and the tip hangs below the clamp."""
     layout = read_layout(ROOT / "datasets" / "specimens" / f"{name}.yaml")
-    seen = np.random.default_rng(lost + 7).permutation(visible_markers(layout, CAMERA))[lost:]
-    dots = CAMERA.project(hanging(layout.positions[seen], np.radians(slope_deg)))
+    seen = np.random.default_rng(hidden + 7).permutation(visible_markers(layout, CAMERA))[hidden:]
+    dots = CAMERA.project(bend_cantilever(layout.positions[seen], np.radians(slope_deg)))
     assert name_by_layout(dots, layout, CAMERA, "a video") == seen.tolist()
 
 
 @pytest.mark.parametrize(("columns", "rows", "along_mm", "across_mm"), [(12, 4, 8, 4), (20, 5, 5, 3)])
 @pytest.mark.parametrize("slope_deg", [-70, -30, 20, 45, 75])
-def test_far_bent_sheets_of_many_dots_get_their_names(
+def test_strongly_bent_sheets_of_many_dots_are_named(
     columns: int, rows: int, along_mm: float, across_mm: float, slope_deg: float, random: np.random.Generator
 ) -> None:
     x, z = np.meshgrid(5.0 + along_mm * np.arange(columns), across_mm * np.arange(rows))
-    places = 1e-3 * np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
-    layout = MarkerLayout(tuple(f"m{k}" for k in range(len(places))), places)
-    seen = random.permutation(len(places))[4:]
-    dots = CAMERA.project(hanging(places[seen], np.radians(slope_deg)))
+    positions = 1e-3 * np.stack([x.ravel(), np.zeros(x.size), z.ravel()], axis=1)
+    layout = MarkerLayout(tuple(f"m{k}" for k in range(len(positions))), positions)
+    seen = random.permutation(len(positions))[4:]
+    dots = CAMERA.project(bend_cantilever(positions[seen], np.radians(slope_deg)))
     assert name_by_layout(dots, layout, CAMERA, "a video") == seen.tolist()
 
 
 def test_missing_and_false_dots(random: np.random.Generator) -> None:
-    dots = filmed(bend=0.02)
+    dots = project_left_side(bend=0.02)
     kept = np.delete(np.arange(16), [3, 12])
     names = name_by_layout(np.vstack([dots[kept], [[20.0, 30.0], [1200.0, 700.0]]]), LAYOUT, CAMERA, "a video")
     assert names == [*kept.tolist(), -1, -1]
 
 
 @pytest.mark.parametrize("bend", [0.0, 0.002, 0.005, 0.02])
-def test_marks_on_the_frame_do_not_turn_one_side_into_the_other(bend: float, random: np.random.Generator) -> None:
-    """More dots than the near side has markers: the far side's, which stand between those, would match them too."""
-    layout = two_sided(off=0.006)
+def test_static_dots_do_not_swap_the_sides(bend: float, random: np.random.Generator) -> None:
+    """With the static dots, there are more dots than markers on the near side. The far side's would match them too."""
+    layout = two_sided(shift=0.006)
     for _ in range(6):
-        marks = np.column_stack([random.uniform(-30, -6, 3), np.zeros(3), random.uniform(-15, 45, 3)]) / 1000.0
-        names = name_by_layout(np.vstack([filmed(bend=bend), CAMERA.project(marks)]), layout, CAMERA, "a video")
+        static = np.column_stack([random.uniform(-30, -6, 3), np.zeros(3), random.uniform(-15, 45, 3)]) / 1000.0
+        names = name_by_layout(
+            np.vstack([project_left_side(bend=bend), CAMERA.project(static)]), layout, CAMERA, "a video"
+        )
         assert names == [*range(16), -1, -1, -1]
 
 
-def test_all_sides_of_a_clear_body_are_named(random: np.random.Generator) -> None:
-    layout = two_sided(off=0.006)
+def test_all_sides_of_a_transparent_body_are_named(random: np.random.Generator) -> None:
+    layout = two_sided(shift=0.006)
     mixed = random.permutation(32)
     assert name_by_layout(CAMERA.project(layout.positions)[mixed], layout, CAMERA, "a video") == mixed.tolist()
 
 
 def test_another_pattern_is_refused(random: np.random.Generator) -> None:
-    far_apart = np.array([[0.0, 0.0], [1200.0, 10.0], [600.0, 700.0], [10.0, 650.0]])
-    alone = MarkerLayout(LAYOUT.names[:1], LAYOUT.positions[:1])
-    heap = MarkerLayout(LAYOUT.names[:4], LAYOUT.positions[[0, 0, 0, 0]])
-    for dots, layout in ((far_apart, LAYOUT), (filmed(), alone), (filmed(), heap)):
+    unrelated = np.array([[0.0, 0.0], [1200.0, 10.0], [600.0, 700.0], [10.0, 650.0]])
+    single = MarkerLayout(LAYOUT.names[:1], LAYOUT.positions[:1])
+    coincident = MarkerLayout(LAYOUT.names[:4], LAYOUT.positions[[0, 0, 0, 0]])
+    for dots, layout in ((unrelated, LAYOUT), (project_left_side(), single), (project_left_side(), coincident)):
         with pytest.raises(InputError, match="a video: expected dots in the pattern"):
             name_by_layout(dots, layout, CAMERA, "a video")
 
 
-def test_rows_and_columns(random: np.random.Generator) -> None:
-    """A tilted grid with uneven columns is named in reading order."""
+def test_rows_and_columns_of_a_tilted_grid(random: np.random.Generator) -> None:
+    """A grid with uneven columns is named in reading order."""
     x, y = np.meshgrid([10.0, 90, 160, 260], [20.0, 130, 240])
     dots = np.stack([x.ravel(), y.ravel() + 0.04 * x.ravel()], axis=1)
     mixed = random.permutation(12)
     names = name_by_rows(dots[mixed])
-    for place, dot in enumerate(mixed):
-        assert names[place] == f"r{dot // 4 + 1}c{dot % 4 + 1}"
+    for index, dot in enumerate(mixed):
+        assert names[index] == f"r{dot // 4 + 1}c{dot % 4 + 1}"
 
 
 def test_rows_of_a_bent_beam(random: np.random.Generator) -> None:
-    """The tip hangs by more than the rows stand apart."""
+    """The tip is lowered by more than the row spacing."""
     x, y = np.meshgrid(30.0 * np.arange(10), 24.0 * np.arange(3))
     slope = 0.9 * x / x.max()
     dots = np.stack([x - 0.1 * x * slope - y * np.sin(slope), 0.45 * slope * x + y * np.cos(slope)], axis=-1)
