@@ -48,7 +48,7 @@ lint: install build/types
 
 # The documentation site, in build/site; a broken link or reference is an error.
 docs: install build/types
-	$(BIN)/mkdocs build --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build
 
 # The pictures of the site's gallery, from the demonstration's output.
 gallery: demo

@@ -35,7 +35,7 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
 
 def _with_equations(text: str) -> str:
     text = re.sub(r"\$\$(.+?)\$\$", lambda m: convert(m[1].strip(), display="block"), text, flags=re.DOTALL)
-    return re.sub(r"\$([^$\n]+)\$", lambda m: convert(m[1]).replace("|", "&#124;"), text)
+    return re.sub(r"\$([^$\n]+)\$", lambda m: f"<span>{convert(m[1])}</span>".replace("|", "&#124;"), text)
 
 
 def _table(name: str) -> str:

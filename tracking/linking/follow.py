@@ -74,22 +74,22 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     reading = video.read()
     for frame in reading:
         times.append(frame.time)
-        damaged.append(frame.picture is None)
-        detected = Detections(NO_POSITIONS, NO_POSITIONS, NO_POSITIONS, NO_POSITIONS[:, 0], frame.lag)
-        if frame.picture is not None and tracker is None:
-            found = find_markers(frame.picture)
+        damaged.append(frame.image is None)
+        detected = Detections(NO_POSITIONS, NO_POSITIONS, NO_POSITIONS, NO_POSITIONS[:, 0], frame.lag_factor)
+        if frame.image is not None and tracker is None:
+            found = find_markers(frame.image)
             max_dots = max(max_dots, 0 if found is None else len(found[1]))
             if found is not None and len(found[1]) >= MIN_MARKERS:
                 tracker = Tracker(*found)
                 noise = noise_fraction(found[1].uncorrelated_residual, found[1].residual)
-                detected = Detections.of(tracker.complete_views.correct(frame.picture, found[1]), frame)
-        elif frame.picture is not None and tracker is not None:
-            detected = Detections.of(tracker.advance(frame.picture), frame)
-            late += tracker.add_late_markers(len(times) - 1, frame.picture)
+                detected = Detections.of(tracker.complete_views.correct(frame.image, found[1]), frame)
+        elif frame.image is not None and tracker is not None:
+            detected = Detections.of(tracker.advance(frame.image), frame)
+            late += tracker.add_late_markers(len(times) - 1, frame.image)
         elif tracker is not None:
             tracker.skip_frame()
-        if frame.picture is not None and tracker is not None:
-            worst_frames.consider(len(times) - 1, frame.picture, detected.sigma)
+        if frame.image is not None and tracker is not None:
+            worst_frames.consider(len(times) - 1, frame.image, detected.sigma)
         detections.append(detected)
         tick()
     if all(damaged):
@@ -133,7 +133,7 @@ class Detections:
     def of(cls, dots: Dots, frame: Frame) -> "Detections":
         """From the dots of a frame; those without a sigma are not visible."""
         pixel = np.where(np.isfinite(dots.sigma), dots.centre, np.nan)
-        return cls(pixel, dots.sigma, dots.noise_gain, frame.step_at(pixel), frame.lag)
+        return cls(pixel, dots.sigma, dots.noise_gain, frame.quantisation_step_at(pixel), frame.lag_factor)
 
 
 def _assemble(

@@ -1,1 +1,1 @@
-"""3-D positions from pixels, their uncertainty, filled gaps, and the tracks file."""
+"""Triangulation, uncertainty, gap filling, and the tracks file."""

@@ -1,40 +1,24 @@
-"""Tracks in other programs' formats."""
+"""Export of tracks to other programs' formats: CSV, C3D, TRC and NumPy."""
 
 from collections.abc import Callable
 from pathlib import Path
 
 import ezc3d
 import numpy as np
-import pandas as pd
+
+from rafl.common.files import atomic_file, write_text
 from rafl.tracking.reconstruction.gap_filling import FILLED, MISSING
 from rafl.tracking.reconstruction.tracks import Tracks
 
-from rafl.common.files import whole_file, write_text
-
-STATES = ("missing", "measured", "filled")
-
 
 def write_csv(path: Path, tracks: Tracks) -> None:
-    """One row a frame and marker, in mm."""
-    frames, markers = tracks.state.shape
-    table = pd.DataFrame(
-        {
-            "frame": np.repeat(np.arange(frames), markers),
-            "time_s": np.repeat(tracks.time, markers),
-            "marker": np.tile(np.array(tracks.names, dtype=object), frames),
-        }
-    )
-    for axis, name in enumerate("xyz"):
-        table[f"{name}_mm"] = 1e3 * tracks.position[..., axis].ravel()
-    for axis, name in enumerate("xyz"):
-        table[f"sigma_{name}_mm"] = 1e3 * tracks.sigma[..., axis].ravel()
-    table["state"] = np.array(STATES, dtype=object)[tracks.state.ravel()]
-    with whole_file(path) as temporary:
-        table.to_csv(temporary, index=False, float_format="%.6g")
+    """Write a CSV table with one row per frame and marker, in mm."""
+    with atomic_file(path) as temporary:
+        tracks.table().to_csv(temporary, index=False, float_format="%.6g")
 
 
 def write_c3d(path: Path, tracks: Tracks) -> None:
-    """Points in mm; a missing point has residual -1, a filled one 0, a measured one its sigma."""
+    """Write a C3D file, in mm. The residual is -1 for a missing point, 0 for a filled one, sigma for a measured one."""
     missing = tracks.state == MISSING
     file = ezc3d.c3d()
     points = np.ones((4, len(tracks.names), len(tracks.time)))
@@ -48,12 +32,12 @@ def write_c3d(path: Path, tracks: Tracks) -> None:
     file["data"]["points"] = points
     file["data"]["meta_points"]["residuals"] = residual.T[None]
     file["data"]["meta_points"]["camera_masks"] = np.zeros((7, len(tracks.names), len(tracks.time)), dtype=bool)
-    with whole_file(path) as temporary:
+    with atomic_file(path) as temporary:
         file.write(str(temporary))
 
 
 def write_trc(path: Path, tracks: Tracks) -> None:
-    """OpenSim's table, in mm; cells of missing markers stay empty."""
+    """Write OpenSim's TRC table, in mm. Cells of missing markers stay empty."""
     rate, frames, markers = f"{tracks.fps:.6g}", len(tracks.time), len(tracks.names)
     keys = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
     lines = [
@@ -71,8 +55,8 @@ def write_trc(path: Path, tracks: Tracks) -> None:
 
 
 def write_npy(path: Path, tracks: Tracks) -> None:
-    """The paper authors' array (T, M, 3) in mm, NaN where missing."""
-    with whole_file(path) as temporary, temporary.open("wb") as stream:
+    """Write the paper authors' array (T, M, 3), in mm, NaN where missing."""
+    with atomic_file(path) as temporary, temporary.open("wb") as stream:
         np.save(stream, 1e3 * tracks.position)
 
 
@@ -85,5 +69,5 @@ WRITERS: dict[str, Callable[[Path, Tracks], None]] = {
 
 
 def export_name(kind: str, recording: str, number: int) -> str:
-    """File name of a recording's export; `number` counts recordings, as the authors' arrays do."""
+    """File name of a recording's export. `number` is that of the recording, by which the authors name their arrays."""
     return f"q{number}.npy" if kind == "npy" else f"{recording}.{kind}"

@@ -1,4 +1,4 @@
-"""Bridging gaps: markers out of sight for a few frames."""
+"""Filling gaps: positions of markers that are out of sight for a few frames."""
 
 import itertools
 from typing import Any
@@ -10,26 +10,28 @@ from scipy.interpolate import CubicSpline
 Array = NDArray[Any]
 
 MISSING, MEASURED, FILLED = 0, 1, 2
-MODES = 12  # of the body's motion that a gap is filled from
-FEWEST_FRAMES = 12  # seen, before a marker is said to move as others do
-WIDEST = 400  # frames on either side of a gap that are learned from
-ALIKE = 0.1  # of the motion's mean square: frames in which the body was bent as unlike as that count for half
-# What the others do not tell of a marker's path is alike over so many frames, and is asked of so many around a gap.
-LASTING, AROUND = 2.5, 8
+MAX_MODES = 12  # of the body's motion, in the regression on the other markers
+MIN_TRAINING_FRAMES = 12  # in which the marker and the others are seen
+TRAINING_WINDOW = 400  # frames on either side of a gap that the regression uses
+# Frames count by the similarity of the body's shape to that in the gap: a squared difference of this share of the mean
+# square amplitude halves the weight.
+SIMILARITY_SCALE = 0.1
+CORRELATION_FRAMES = 2.5  # over which the regression's residuals are correlated
+RESIDUAL_WINDOW = 8  # frames on either side of a gap whose residuals are used
 
 
 def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple[Array, Array, NDArray[np.uint8]]:
-    """Bridge gaps of up to `longest` frames; longer ones stay NaN.
+    """Fill gaps of up to `longest` frames; longer ones stay NaN.
 
-    All markers ride on one body that moves in a few modes: where others are seen, a marker is put where it
-    stood whenever the others stood so, and nearer to its own path by what that misses in the frames around. Where none
-    is seen, a cubic through the frames around. Sigma grows by how far off either way may be.
+    All markers ride on one body that moves in a few modes. If others are seen in the gap, the marker is predicted from
+    them by a regression trained on the frames around, corrected by the regression's residuals near the gap. If too few
+    are seen, a cubic spline through the frames around is used. Sigma grows by the uncertainty of either.
 
     Args:
         position: [m], (T, M, 3), NaN where missing.
-        sigma: [m], (T, M, 3).
+        sigma: standard deviation [m], (T, M, 3).
         time: [s], (T).
-        longest: gap that is bridged [frames].
+        longest: longest gap to fill [frames].
 
     Returns:
         Positions, sigma (T, M, 3) and states (T, M): 0 missing, 1 measured, 2 filled.
@@ -45,103 +47,108 @@ def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple
             if not 1 < after - before <= longest + 1:
                 continue
             ends = np.maximum(sigma[before, marker], sigma[after, marker]) ** 2
-            whole = np.arange(before + 1, after)
-            for gap in _by_who_is_seen(whole, seen):
-                bridge = _as_the_others(position, seen, marker, gap)
+            gap = np.arange(before + 1, after)
+            for part in _split_by_seen(gap, seen):
+                bridge = _predict_from_others(position, seen, marker, part)
                 if bridge is None:
-                    bridge = _along_its_path(position[:, marker], time, frames, gap, before, after)
-                filled[gap, marker] = bridge[0]
-                grown[gap, marker] = np.sqrt(np.maximum(bridge[1], 1.5 * ends))
-            state[whole, marker] = FILLED
+                    bridge = _interpolate_path(position[:, marker], time, frames, part, before, after)
+                filled[part, marker] = bridge[0]
+                grown[part, marker] = np.sqrt(np.maximum(bridge[1], 1.5 * ends))
+            state[gap, marker] = FILLED
     return filled, grown, state
 
 
-def _by_who_is_seen(gap: NDArray[np.int64], seen: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
-    """The frames of a gap, those together in which the same markers are seen."""
-    kinds, kind = np.unique(seen[gap], axis=0, return_inverse=True)
-    return [gap[kind.ravel() == number] for number in range(len(kinds))]
+def _split_by_seen(gap: NDArray[np.int64], seen: NDArray[np.bool_]) -> list[NDArray[np.int64]]:
+    """The frames of a gap, grouped by which markers are seen in them."""
+    groups, group = np.unique(seen[gap], axis=0, return_inverse=True)
+    return [gap[group.ravel() == number] for number in range(len(groups))]
 
 
-def _as_the_others(
+def _predict_from_others(
     position: Array, seen: NDArray[np.bool_], marker: int, gap: NDArray[np.int64]
 ) -> tuple[Array, Array] | None:
-    """Positions and variances (G, 3) from the markers seen in a gap, the same in all of it; None where few are."""
-    near = np.arange(max(gap[0] - WIDEST, 0), min(gap[-1] + WIDEST, len(position) - 1) + 1)
+    """Positions and variances (G, 3) in a gap from the markers seen in all of it; None if there are too few data."""
+    near = np.arange(max(gap[0] - TRAINING_WINDOW, 0), min(gap[-1] + TRAINING_WINDOW, len(position) - 1) + 1)
     others = np.flatnonzero(seen[gap[0]])
     others = others[others != marker]
     others = others[seen[np.ix_(near, others)].mean(axis=0) > 0.7] if len(others) else others
     if len(others) < 3:
         return None
-    taught = near[seen[near, marker] & seen[np.ix_(near, others)].all(axis=1)]
-    if len(taught) < FEWEST_FRAMES:
+    training = near[seen[near, marker] & seen[np.ix_(near, others)].all(axis=1)]
+    if len(training) < MIN_TRAINING_FRAMES:
         return None
-    inputs, own = position[np.ix_(taught, others)].reshape(len(taught), -1), position[taught, marker]
+    inputs, own = position[np.ix_(training, others)].reshape(len(training), -1), position[training, marker]
     mean = inputs.mean(0)
     _, size, modes = np.linalg.svd(inputs - mean, full_matrices=False)
-    count = min(MODES, len(taught) // 3, int((size > 1e-6 * size[0]).sum()))
+    count = min(MAX_MODES, len(training) // 3, int((size > 1e-6 * size[0]).sum()))
     basis = modes[:count].T
-    amounts = (inputs - mean) @ basis
-    # Where the body was bent alike counts for more: how markers ride on it is not quite linear.
+    amplitudes = (inputs - mean) @ basis
+    # Similar shapes count for more, because the relation between the markers is not quite linear.
     here = (position[np.ix_(gap, others)].reshape(len(gap), -1) - mean) @ basis
-    unlike = ((amounts - here.mean(0)) ** 2).sum(1) / (amounts**2).sum(1).mean()
-    weight = (1.0 / (ALIKE + unlike))[:, None]
-    weight *= len(taught) / weight.sum()
+    difference = ((amplitudes - here.mean(0)) ** 2).sum(1) / (amplitudes**2).sum(1).mean()
+    weight = (1.0 / (SIMILARITY_SCALE + difference))[:, None]
+    weight *= len(training) / weight.sum()
     ridge = 1e-8 * size[0] ** 2 * np.eye(count)
-    own_mean, shift = (weight * own).mean(0), (weight * amounts).mean(0)
-    centred = amounts - shift
+    own_mean, shift = (weight * own).mean(0), (weight * amplitudes).mean(0)
+    centred = amplitudes - shift
     gain = np.linalg.solve(centred.T @ (weight * centred) + ridge, centred.T @ (weight * (own - own_mean)))
-    away = own - own_mean - centred @ gain
-    missed, variance = _what_they_miss(away, weight, taught, gap, max(len(taught) - count, 1))
-    return (here - shift) @ gain + own_mean + missed, variance
+    residual = own - own_mean - centred @ gain
+    offset, variance = _predict_residual(residual, weight, training, gap, max(len(training) - count, 1))
+    return (here - shift) @ gain + own_mean + offset, variance
 
 
-def _what_they_miss(
-    away: Array, weight: Array, frames: NDArray[np.int64], gap: NDArray[np.int64], free: int
+def _predict_residual(
+    residual: Array, weight: Array, frames: NDArray[np.int64], gap: NDArray[np.int64], degrees_of_freedom: int
 ) -> tuple[Array, Array]:
-    """Likeliest of what the others miss of a path in a gap, and how uncertain that is: its variance, (G, 3) each.
+    """The regression's residual in a gap, and its variance, (G, 3) each, by Gaussian process regression.
 
-    A Gaussian process with Matern's covariance of order 3/2: a part that lasts and a part that each frame has anew,
-    told apart by what frames side by side share.
+    The covariance is that of Matern of order 3/2 for a lasting part, plus white noise. Adjacent frames, which share the
+    lasting part, give the two variances.
 
     Args:
-        away: what they miss in other frames, (F, 3).
-        weight: how much these frames count, (F, 1), 1 on the average.
-        frames: which these are, (F).
-        gap: (G).
-        free: degrees of freedom left in `away`.
+        residual: in other frames, (F, 3).
+        weight: of these frames, (F, 1), 1 on average.
+        frames: their numbers, (F).
+        gap: frame numbers, (G).
+        degrees_of_freedom: left in `residual`.
     """
-    beside = np.flatnonzero(np.diff(frames) == 1)
-    pairs = max(free * len(beside) / len(frames), 1.0)
-    square = (weight * away**2).sum(0) / free
-    shared = (np.sqrt(weight[beside] * weight[beside + 1]) * away[beside] * away[beside + 1]).sum(0) / pairs
+    adjacent = np.flatnonzero(np.diff(frames) == 1)
+    pairs = max(degrees_of_freedom * len(adjacent) / len(frames), 1.0)
+    square = (weight * residual**2).sum(0) / degrees_of_freedom
+    pair_weight = np.sqrt(weight[adjacent] * weight[adjacent + 1])
+    shared = (pair_weight * residual[adjacent] * residual[adjacent + 1]).sum(0) / pairs
     lasting = np.clip(shared, 1e-3 * square, square)
-    anew = np.maximum(square - lasting, 1e-3 * square) + 1e-30
-    around = np.flatnonzero((frames >= gap[0] - AROUND) & (frames <= gap[-1] + AROUND))
-    if len(around):  # the body may be where they miss more than elsewhere
-        lasting = np.maximum(lasting, (away[around] ** 2).mean(0) - anew)
-    of_all, of_gap = _alike(frames[around], frames[around]), _alike(gap, frames[around])
-    missed, variance = np.empty((2, len(gap), 3))
+    white = np.maximum(square - lasting, 1e-3 * square) + 1e-30
+    around = np.flatnonzero((frames >= gap[0] - RESIDUAL_WINDOW) & (frames <= gap[-1] + RESIDUAL_WINDOW))
+    if len(around):  # the residuals near the gap may be larger than elsewhere
+        lasting = np.maximum(lasting, (residual[around] ** 2).mean(0) - white)
+    among_frames, with_gap = _correlation(frames[around], frames[around]), _correlation(gap, frames[around])
+    predicted, variance = np.empty((2, len(gap), 3))
     for axis in range(3):
-        covariance = lasting[axis] * of_all + anew[axis] * np.eye(len(around))
-        told = np.linalg.solve(covariance, lasting[axis] * of_gap.T)
-        missed[:, axis] = told.T @ away[around, axis]
-        variance[:, axis] = lasting[axis] * (1.0 - (of_gap.T * told).sum(axis=0)) + anew[axis]
-    return missed, variance
+        covariance = lasting[axis] * among_frames + white[axis] * np.eye(len(around))
+        weights = np.linalg.solve(covariance, lasting[axis] * with_gap.T)
+        predicted[:, axis] = weights.T @ residual[around, axis]
+        variance[:, axis] = lasting[axis] * (1.0 - (with_gap.T * weights).sum(axis=0)) + white[axis]
+    return predicted, variance
 
 
-def _alike(frames: NDArray[np.int64], others: NDArray[np.int64]) -> Array:
-    """Correlation of what lasts between frames (F) and others (G), (F, G)."""
-    apart = np.sqrt(3.0) * np.abs(frames[:, None] - others) / LASTING
-    return (1.0 + apart) * np.exp(-apart)
+def _correlation(frames: NDArray[np.int64], others: NDArray[np.int64]) -> Array:
+    """Matern correlation of the lasting part between frames (F) and others (G), (F, G)."""
+    distance = np.sqrt(3.0) * np.abs(frames[:, None] - others) / CORRELATION_FRAMES
+    correlation: Array = (1.0 + distance) * np.exp(-distance)
+    return correlation
 
 
-def _along_its_path(
+def _interpolate_path(
     path: Array, time: Array, frames: NDArray[np.int64], gap: NDArray[np.int64], before: int, after: int
 ) -> tuple[Array, Array]:
-    """Positions (G, 3) on a cubic through the frames around, and the square of half its bend across the gap (G, 3)."""
+    """Positions (G, 3) on a cubic spline through the frames around, and their variances (G, 3).
+
+    The standard deviation is half the distance between the spline and the chord across the gap.
+    """
     around = frames[np.abs(frames - 0.5 * (before + after)) < 40]
     around = around if len(around) >= 4 else frames
     curve = CubicSpline(time[around], path[around])(time[gap])
     share = ((time[gap] - time[before]) / (time[after] - time[before]))[:, None]
-    line = (1.0 - share) * path[before] + share * path[after]
-    return curve, (0.5 * (curve - line)) ** 2
+    chord = (1.0 - share) * path[before] + share * path[after]
+    return curve, (0.5 * (curve - chord)) ** 2

@@ -6,40 +6,43 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from rafl.common.errors import InputError
-from rafl.common.files import require_file, whole_file
+from rafl.common.files import atomic_file, require_file
+from rafl.common.marker_table import marker_table
 from rafl.common.version import VERSION
 from rafl.common.yaml_files import check_format
 
 Array = NDArray[Any]
 
 FORMAT = "rafl-tracks/1"
-OF_CAMERA = ("pixel", "residual", "pixel_sigma", "damaged", "frame")
+STATES = ("missing", "measured", "filled")  # words for the values of `Tracks.state`
+PER_CAMERA_ARRAYS = ("pixel", "residual", "pixel_sigma", "damaged", "frame")
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Markers of one recording, world frame.
+    """Markers of one recording, in the world frame.
 
     Attributes:
         names: of the markers, (M).
         time: [s], (T).
         position: [m], (T, M, 3), NaN where missing.
-        sigma: one standard deviation [m], (T, M, 3).
+        sigma: standard deviation of the position [m], (T, M, 3).
         state: 0 missing, 1 measured, 2 filled, (T, M).
-        pixel: by camera (T, M, 2) [px], NaN where not seen.
+        pixel: by camera, (T, M, 2) [px], NaN where not seen.
         residual: reprojection residual by camera, (T, M) [px].
-        pixel_sigma: one standard deviation of each coordinate by camera, (T, M, 2) [px].
-        damaged: frames by camera that could not be decoded, (T).
+        pixel_sigma: standard deviation of each pixel coordinate by camera, (T, M, 2) [px].
+        damaged: by camera, whether the frame could not be decoded, (T).
         frame: by camera, the number in its video of the frame shown at each time, -1 for none, (T).
-        pictures: by camera, the first frame and the worst, by number, as JPEG.
+        images: by camera, the first and the worst frames, by frame number, as JPEG.
         fps: frames per second.
         calibration: text of calib.yaml; empty for positions from elsewhere.
         sources: SHA-256 by source file.
         settings: text of the settings used.
-        notes: what the videos said that contradicts itself.
+        notes: on contradictory video data, damaged frames and clock delays.
         version: of the program that tracked.
     """
 
@@ -53,7 +56,7 @@ class Tracks:
     pixel_sigma: dict[str, Array]
     damaged: dict[str, NDArray[np.bool_]]
     frame: dict[str, NDArray[np.int64]]
-    pictures: dict[str, dict[int, bytes]]
+    images: dict[str, dict[int, bytes]]
     fps: float
     calibration: str
     sources: dict[str, str]
@@ -61,14 +64,23 @@ class Tracks:
     notes: tuple[str, ...] = ()
     version: str = VERSION
 
-    def rows(self, camera: str) -> dict[int, int]:
-        """The first row that shows each frame of a camera's video, by the frame's number."""
+    def table(self) -> pd.DataFrame:
+        """One row per frame and marker: frame, time_s, marker, x_mm, ..., sigma_x_mm, ..., state (in words)."""
+        table = marker_table(self.time, self.names, self.position)
+        for axis, name in enumerate("xyz"):
+            table[f"sigma_{name}_mm"] = 1e3 * self.sigma[..., axis].ravel()
+        table["state"] = np.array(STATES, dtype=object)[self.state.ravel()]
+        return table
+
+    def rows_by_frame(self, camera: str) -> dict[int, int]:
+        """By frame number in a camera's video, the first row (index along T) that shows the frame."""
         return {number: row for row, number in reversed(list(enumerate(self.frame[camera].tolist())))}
 
 
 def write_tracks(path: Path, tracks: Tracks) -> None:
-    """Write a tracks file, whole or not at all."""
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+    """Write a tracks file, completely or not at all."""
+    sources = [f"{digest}  {name}" for name, digest in tracks.sources.items()]
+    with atomic_file(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(
             {
                 "format": FORMAT,
@@ -79,23 +91,23 @@ def write_tracks(path: Path, tracks: Tracks) -> None:
                 "software": f"rafl {tracks.version}",
                 "settings": tracks.settings,
                 "notes": np.array(tracks.notes, dtype=h5py.string_dtype()),
-                "sources": np.array([f"{h}  {n}" for n, h in tracks.sources.items()], h5py.string_dtype()),
+                "sources": np.array(sources, h5py.string_dtype()),
             }
         )
         for key in ("time", "position", "sigma", "state"):
             file.create_dataset(key, data=getattr(tracks, key), fletcher32=True)
         for name in tracks.pixel:
-            for key in OF_CAMERA:
+            for key in PER_CAMERA_ARRAYS:
                 file.create_dataset(f"cameras/{name}/{key}", data=getattr(tracks, key)[name], fletcher32=True)
-            for number, picture in sorted(tracks.pictures[name].items()):
-                file[f"cameras/{name}/pictures/{number}"] = np.frombuffer(picture, np.uint8)
+            for number, image in sorted(tracks.images[name].items()):
+                file[f"cameras/{name}/pictures/{number}"] = np.frombuffer(image, np.uint8)
 
 
 def read_tracks(path: Path) -> Tracks:
     """Read a tracks file.
 
     Raises:
-        InputError: missing, not a tracks file, newer, or damaged.
+        InputError: the file is missing, no tracks file, of a newer version, or damaged.
     """
     require_file(path, "a tracks file (.h5)")
     try:
@@ -103,8 +115,8 @@ def read_tracks(path: Path) -> Tracks:
             check_format(str(file.attrs.get("format", "")), FORMAT, path)
             cameras = file.get("cameras", {})
             lines = [str(line).split("  ", 1) for line in file.attrs["sources"]]
-            of_camera = {key: {name: group[key][()] for name, group in cameras.items()} for key in OF_CAMERA}
-            pictures = {
+            by_camera = {key: {name: group[key][()] for name, group in cameras.items()} for key in PER_CAMERA_ARRAYS}
+            images = {
                 name: {int(number): bytes(data[()]) for number, data in group.get("pictures", {}).items()}
                 for name, group in cameras.items()
             }
@@ -114,12 +126,12 @@ def read_tracks(path: Path) -> Tracks:
                 position=file["position"][()],
                 sigma=file["sigma"][()],
                 state=file["state"][()],
-                pixel=of_camera["pixel"],
-                residual=of_camera["residual"],
-                pixel_sigma=of_camera["pixel_sigma"],
-                damaged=of_camera["damaged"],
-                frame=of_camera["frame"],
-                pictures=pictures,
+                pixel=by_camera["pixel"],
+                residual=by_camera["residual"],
+                pixel_sigma=by_camera["pixel_sigma"],
+                damaged=by_camera["damaged"],
+                frame=by_camera["frame"],
+                images=images,
                 fps=float(file.attrs["fps"]),
                 calibration=str(file.attrs["calibration"]),
                 sources={name: digest for digest, name in lines},

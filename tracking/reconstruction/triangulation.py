@@ -1,50 +1,50 @@
-"""From pixels of calibrated cameras to 3-D positions with their uncertainty."""
+"""Triangulation: 3-D positions and their uncertainty from the pixels of calibrated cameras."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rafl.calibration.camera import OrthographicCamera
-from rafl.calibration.rig import Rig
 from scipy.interpolate import CubicSpline
 
+from rafl.calibration.camera import OrthographicCamera
+from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
 
 Array = NDArray[Any]
 
-SAME_FRAME = 0.02  # of a frame: clocks closer than this need no interpolation
-WRONG = 6.0  # standard deviations of a residual, and
-WRONG_PIXELS = 1.5  # px on top: beyond both, a camera is taken to have seen something else
-STEPS = 8  # of Gauss and Newton; a pinhole camera's equations are not quite linear
+SAME_TIME_FRAMES = 0.02  # times that differ by less than this need no interpolation [frame intervals]
+# A camera is an outlier if its residual exceeds so many standard deviations plus so many pixels.
+OUTLIER_SIGMAS, OUTLIER_PIXELS = 6.0, 1.5
+MAX_ITERATIONS = 8  # of Gauss-Newton; a pinhole camera's equations are not quite linear
 
 
 @dataclass(frozen=True)
 class CameraPixels:
-    """What one camera saw of the named markers.
+    """Pixels of the named markers in one camera.
 
     Attributes:
         pixel: (T, M, 2), NaN where not seen.
-        sigma: of each coordinate [px], (T, M, 2), NaN where not seen.
+        sigma: standard deviation of each coordinate [px], (T, M, 2), NaN where not seen.
     """
 
     pixel: Array
     sigma: Array
 
 
-def at_times(pixels: CameraPixels, own: Array, asked: Array) -> CameraPixels:
-    """A camera's pixels at other times than its own, by a cubic through the frames around each.
+def resample_pixels(pixels: CameraPixels, own: Array, requested: Array) -> CameraPixels:
+    """A camera's pixels at other times than those of its frames, by a cubic spline.
 
-    NaN outside its recording and where one of the two frames around was not seen.
+    NaN outside the recording, and where one of the two frames around a time does not show the marker.
 
     Args:
         pixels: as filmed.
-        own: times of the frames filmed [s], (S).
-        asked: [s], (T).
+        own: times of the frames [s], (S).
+        requested: times [s], (T).
     """
-    step = float(np.median(np.diff(own)))
-    nearest = nearest_frames(own, asked)
-    same = np.abs(own[nearest] - asked) < SAME_FRAME * step
+    interval = float(np.median(np.diff(own)))
+    nearest = nearest_frames(own, requested)
+    same = np.abs(own[nearest] - requested) < SAME_TIME_FRAMES * interval
     pixel = np.where(same[:, None, None], pixels.pixel[nearest], np.nan)
     sigma = np.where(same[:, None, None], pixels.sigma[nearest], np.nan)
     if same.all():
@@ -54,44 +54,45 @@ def at_times(pixels: CameraPixels, own: Array, asked: Array) -> CameraPixels:
         if len(seen) < 4:
             continue
         spline = CubicSpline(own[seen], pixels.pixel[seen, marker])
-        after = np.searchsorted(own[seen], asked)
+        after = np.searchsorted(own[seen], requested)
         inside = (after > 0) & (after < len(seen)) & ~same
         gap = own[seen[np.minimum(after, len(seen) - 1)]] - own[seen[np.maximum(after - 1, 0)]]
-        usable = inside & (gap < 1.6 * step)
-        pixel[usable, marker] = spline(asked[usable])
+        usable = inside & (gap < 1.6 * interval)
+        pixel[usable, marker] = spline(requested[usable])
         for axis in range(2):
-            sigma[usable, marker, axis] = np.interp(asked[usable], own[seen], pixels.sigma[seen, marker, axis])
+            sigma[usable, marker, axis] = np.interp(requested[usable], own[seen], pixels.sigma[seen, marker, axis])
     return CameraPixels(pixel, sigma)
 
 
-def nearest_frames(own: Array, asked: Array) -> NDArray[np.int64]:
-    """Of frames at times own (S >= 2), rising, the nearest to each time asked (T)."""
-    after = np.clip(np.searchsorted(own, asked), 1, len(own) - 1)
-    return after - (asked - own[after - 1] < own[after] - asked)
+def nearest_frames(own: Array, requested: Array) -> NDArray[np.int64]:
+    """Index of the frame nearest to each requested time (T), for frames at increasing times `own` (S >= 2)."""
+    after = np.clip(np.searchsorted(own, requested), 1, len(own) - 1)
+    nearest: NDArray[np.int64] = after - (requested - own[after - 1] < own[after] - requested)
+    return nearest
 
 
-def shown_frames(own: Array, asked: Array) -> NDArray[np.int64]:
-    """Of frames at times own (S >= 2), the one that shows each time asked (T); -1 where none is within half a frame."""
-    nearest = nearest_frames(own, asked)
-    return np.where(np.abs(own[nearest] - asked) <= 0.5 * np.median(np.diff(own)), nearest, -1)
+def shown_frames(own: Array, requested: Array) -> NDArray[np.int64]:
+    """Index of the frame shown at each requested time (T): the nearest, -1 if it is over half a frame interval away."""
+    nearest = nearest_frames(own, requested)
+    return np.where(np.abs(own[nearest] - requested) <= 0.5 * np.median(np.diff(own)), nearest, -1)
 
 
 def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array, dict[str, Array]]:
-    """Weighted least squares over the cameras that see a marker; its plane where only one does.
+    """Triangulate every marker by weighted least squares over the cameras that see it.
 
-    A camera whose residual says that it saw something else is left out; where two disagree and nobody
-    says which is wrong, the marker counts as not seen.
+    Where one camera alone sees a marker, that camera's plane is added as a measurement. A camera with too large a
+    residual is left out. If only two cameras see a marker and they disagree, it counts as not seen.
 
     Args:
         rig: the cameras.
         pixels: by camera.
 
     Returns:
-        Positions (T, M, 3) [m], NaN where no camera sees the marker, or one that has no plane; one standard deviation
-        (T, M, 3) [m]; reprojection residual by camera (T, M) [px].
+        Positions (T, M, 3) [m], NaN where no camera sees the marker, or only one without a plane; their standard
+        deviations (T, M, 3) [m]; reprojection residuals by camera (T, M) [px].
 
     Raises:
-        InputError: all markers seen by one camera alone that has no plane.
+        InputError: a camera without a plane sees markers alone, and no marker is seen by several cameras.
     """
     seen = {name: np.isfinite(item.sigma[..., 0]) for name, item in pixels.items()}
     ideal = {name: rig.cameras[name].undistort(item.pixel) for name, item in pixels.items()}
@@ -104,48 +105,51 @@ def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array
                     f"`plane: {{normal: ..., offset_mm: ...}}` to camera {name} in calib.yaml"
                 )
             seen[name] = seen[name] & ~alone
-    solved = _Solved.of(rig, pixels, ideal, seen)
-    excess = _excess(rig, pixels, seen, solved.position)
-    wrong = (_count(seen) > 1) & (np.max(list(excess.values()), axis=0) > 0)
-    if wrong.any():
-        seen = _without_wrong(rig, pixels, ideal, seen, wrong)
-        solved = _Solved.of(rig, pixels, ideal, seen)
+    solution = _Solution.of(rig, pixels, ideal, seen)
+    excess = _excess(rig, pixels, seen, solution.position)
+    outlying = (_count(seen) > 1) & (np.max(list(excess.values()), axis=0) > 0)
+    if outlying.any():
+        seen = _drop_outliers(rig, pixels, ideal, seen, outlying)
+        solution = _Solution.of(rig, pixels, ideal, seen)
     residual = {
-        name: np.linalg.norm(rig.cameras[name].project(solved.position) - item.pixel, axis=-1)
+        name: np.linalg.norm(rig.cameras[name].project(solution.position) - item.pixel, axis=-1)
         for name, item in pixels.items()
     }
-    return solved.position, solved.sigma, residual
+    return solution.position, solution.sigma, residual
 
 
 def _count(seen: dict[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
-    """How many cameras see each marker, (T, M)."""
-    return np.sum(list(seen.values()), axis=0)
+    """Number of cameras that see each marker, (T, M)."""
+    count: NDArray[np.int64] = np.sum(list(seen.values()), axis=0)
+    return count
 
 
 @dataclass(frozen=True)
-class _Solved:
+class _Solution:
+    """Positions and their standard deviations [m], (T, M, 3), NaN where no camera sees the marker."""
+
     position: Array
     sigma: Array
 
     @classmethod
     def of(
         cls, rig: Rig, pixels: dict[str, CameraPixels], ideal: dict[str, Array], seen: dict[str, NDArray[np.bool_]]
-    ) -> "_Solved":
-        """Positions and their standard deviations from the cameras marked as seeing them."""
+    ) -> "_Solution":
+        """Solve for the positions from the cameras that see each marker, `seen` (T, M)."""
         count = _count(seen)
         position = np.zeros((*count.shape, 3))
         known = count > 0
         covariance = np.broadcast_to(np.eye(3), (*count.shape, 3, 3))
         linear = all(isinstance(rig.cameras[name], OrthographicCamera) for name in pixels)
-        for _ in range(1 if linear else STEPS):
+        for _ in range(1 if linear else MAX_ITERATIONS):
             normal = np.zeros((*count.shape, 3, 3))
             right = np.zeros((*count.shape, 3))
             for name, item in pixels.items():
                 camera = rig.cameras[name]
-                slopes = camera.slopes(position)
+                slopes = camera.projection_jacobian(position)
                 sigma = np.where(seen[name][..., None], item.sigma, 1.0)
                 weight = np.where(seen[name][..., None], 1.0 / sigma**2, 0.0)
-                gap = np.where(seen[name][..., None], ideal[name] - camera.ideal(position), 0.0)
+                gap = np.where(seen[name][..., None], ideal[name] - camera.project_undistorted(position), 0.0)
                 normal += np.einsum("...k,...ki,...kj->...ij", weight, slopes, slopes)
                 right += np.einsum("...k,...ki,...k->...i", weight, slopes, gap)
                 alone = seen[name] & (count == 1)
@@ -168,39 +172,43 @@ class _Solved:
 def _excess(
     rig: Rig, pixels: dict[str, CameraPixels], seen: dict[str, NDArray[np.bool_]], position: Array
 ) -> dict[str, Array]:
-    """By how many pixels each residual (T, M) exceeds what noise and calibration explain; -inf where not seen."""
+    """Residuals above the outlier limit of noise and calibration, by camera (T, M) [px]; -inf where not seen."""
     result = {}
     for name, item in pixels.items():
         camera = rig.cameras[name]
         gap = np.linalg.norm(camera.project(position) - item.pixel, axis=-1)
         sigma = np.sqrt((item.sigma**2).sum(-1) + 2.0 * camera.residual**2)
         with np.errstate(invalid="ignore"):
-            result[name] = np.where(seen[name], gap - WRONG * sigma - WRONG_PIXELS, -np.inf)
+            result[name] = np.where(seen[name], gap - OUTLIER_SIGMAS * sigma - OUTLIER_PIXELS, -np.inf)
     return result
 
 
-def _without_wrong(
+def _drop_outliers(
     rig: Rig,
     pixels: dict[str, CameraPixels],
     ideal: dict[str, Array],
     seen: dict[str, NDArray[np.bool_]],
-    wrong: NDArray[np.bool_],
+    outlying: NDArray[np.bool_],
 ) -> dict[str, NDArray[np.bool_]]:
-    """Who sees what, after leaving out of every wrong point the one camera without which the others agree."""
+    """Which camera sees which marker, by camera (T, M), without outliers.
+
+    For every outlying marker (T, M), the one camera is left out without which the others agree. If there is no such
+    camera, or there are only two, none sees the marker.
+    """
     names = list(pixels)
     count = _count(seen)
-    result = {name: of_camera & ~(wrong & (count == 2)) for name, of_camera in seen.items()}
-    several = wrong & (count > 2)
+    result = {name: of_camera & ~(outlying & (count == 2)) for name, of_camera in seen.items()}
+    several = outlying & (count > 2)
     if not several.any():
         return result
-    worst = np.full((len(names), *wrong.shape), np.inf)
+    excess_without = np.full((len(names), *outlying.shape), np.inf)
     for k, left_out in enumerate(names):
         others = {name: of_camera & (name != left_out) for name, of_camera in seen.items()}
-        position = _Solved.of(rig, pixels, ideal, others).position
+        position = _Solution.of(rig, pixels, ideal, others).position
         excess = np.max(list(_excess(rig, pixels, others, position).values()), axis=0)
-        worst[k] = np.where(seen[left_out], excess, np.inf)
-    best = worst.argmin(axis=0)
-    agreed = np.take_along_axis(worst, best[None], axis=0)[0] <= 0
+        excess_without[k] = np.where(seen[left_out], excess, np.inf)
+    dropped = excess_without.argmin(axis=0)
+    agreed = np.take_along_axis(excess_without, dropped[None], axis=0)[0] <= 0
     for k, name in enumerate(names):
-        result[name] = result[name] & ~(several & (~agreed | (best == k)))
+        result[name] = result[name] & ~(several & (~agreed | (dropped == k)))
     return result

@@ -1,7 +1,7 @@
-"""How well dots were really located, which one picture cannot tell, and what the other dots' motion can mend.
+"""Errors of marker positions that a single frame does not show, and their correction from the other markers' motion.
 
-Compression moves whole dots a little, most where the picture changes slowly, and leaves no trace in
-the fit. But markers ride on one body: what a marker's path has that the others' do not is error.
+Compression shifts whole dots slightly, most where the image changes slowly. The fit of a dot does not show this error.
+But all markers ride on one body: what a marker's path has that the other markers' paths do not predict is error.
 """
 
 from dataclasses import dataclass
@@ -12,307 +12,339 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-# Errors of coded pictures: along an axis in which the marker keeps still, against the fit's own, which takes errors of
-# neighbouring pixels for independent; and along its way [px], where the encoder lets it lag, of what independent errors
-# of one step in each pixel would make, to a power. Measured on 115 films: libx264, crf 12 to 28, medium preset, noise
-# of 1.5 to 5 grey levels, dots of 6 to 11 px, contrasts of 35 to 150; of quicker presets the decoding tells larger
-# steps.
-STILL, LAGGING, POWER = 1.69, 0.346, 0.664
-# Of these errors' variance, what all markers have in common against what each has alone: times the step over the noise
-# of the first picture, by so much less as the errors are larger than those along an axis in which the marker keeps
-# still, and by so many powers of e more before and after frames to which a marker moves less than SLOW of these errors:
-# where markers turn round, they wait together until the encoder takes notice. Measured on 260 films of six presets of
-# x264 at crf 14 to 30, otherwise as above, of bodies that swing, are let go or move in three modes along any direction.
-SHARED, WAITING, SLOW = 0.030, 3.0, 8.0
-# The share of markers that move by more than these errors from which on others may move too, unseen by the encoder.
-FEW = 0.05
-# So many of the variances of errors across its way tell as much of a marker's direction as its path does.
-UNDIRECTED = 4.0
-# So many of the errors of an encoder in a hurry a marker moves from frame to frame where haste does half its harm.
-# Measured on 48 films of x264's presets from superfast to fast.
-FAST = 13.0
-# So many times these errors may, together, pass for a mode of the body's own motion.
-PASSING = 2.0
-LEAST_GRAIN, SMOOTHEST = 0.6, 0.5  # see `share_of_noise`; and what share of the former counts at least
-# By whose motion places are mended; and errors told, if it has no more modes than may be taken off.
-FEWEST_FRAMES, FEWEST_MARKERS = 40, 8
-FEW_FRAMES, FEW_MARKERS = 12, 4
-MODES = 12  # of the body's motion, at most
-SPARE = 8  # further ones, of which those of the other markers may need a little
-VANISHED = 1e-6  # share of a mode's square that others than one marker have: it is that marker's alone
-TELLING = 0.3  # of a fit's variance: an excess smaller than this may be chance
-OUTLYING = 6.0  # medians of a marker's distances from where the others put it: farther ones are few
-SURPRISING = 3.0  # standard deviations: farther from where the others put it, a marker moves on its own
+# Compression error. Along an axis in which the marker does not move, its standard deviation is STATIC_FACTOR times that
+# of the fit, which assumes that the errors of neighbouring pixels are independent. Along the marker's path, where the
+# encoder lets it lag, it is LAG_COEFFICIENT * e**LAG_EXPONENT [px]; e [px] is the error that independent errors of one
+# quantisation step in each pixel would cause. Measured on 115 videos: libx264, crf 12 to 28, medium preset, noise of
+# 1.5 to 5 grey levels, dots of 6 to 11 px, contrasts of 35 to 150. Faster presets give larger steps.
+STATIC_FACTOR, LAG_COEFFICIENT, LAG_EXPONENT = 1.69, 0.346, 0.664
+# Part of this error that all markers share, as a ratio of variances, shared to own:
+# SHARED_RATIO * r * c * exp(TURNING_EXPONENT * w). r is the quantisation step over the noise of the first frame. c is
+# the error along a static axis over the whole error. w is 1 for a marker that keeps still before and after the frame,
+# and falls to 1/2 at a displacement of about SLOW_ERRORS such errors: where markers turn round, all wait until the
+# encoder updates them. Measured on 260 videos of six presets of x264 at crf 14 to 30, otherwise as above, of bodies
+# that swing, are released or move in three modes along any direction.
+SHARED_RATIO, TURNING_EXPONENT, SLOW_ERRORS = 0.030, 3.0, 8.0
+# If more than this share of the markers move by more than their errors, the others may move too, unseen by the encoder.
+MIN_MOVING_SHARE = 0.05
+# Weight of the body's direction of motion in a marker's [variances of the marker's error along a static axis].
+BODY_DIRECTION_WEIGHT = 4.0
+# Displacement per frame at which the extra error of a fast encoder preset is halved [lag errors]. Measured on 48 videos
+# of x264's presets from superfast to fast.
+FAST_ERRORS = 13.0
+# A mode counts as the body's own motion if it exceeds what independent errors, this many times the compression error,
+# would produce.
+MODE_ERRORS = 2.0
+MIN_UNCORRELATED_SHARE, MIN_NOISE_FRACTION = 0.6, 0.5  # see `noise_fraction`
+# Fewest frames and markers to correct positions; and to estimate errors, if the motion has no more modes than allowed.
+MIN_FRAMES_TO_CORRECT, MIN_MARKERS_TO_CORRECT = 40, 8
+MIN_FRAMES, MIN_MARKERS = 12, 4
+MAX_MODES = 12  # of the body's motion
+SPARE_MODES = 8  # smaller modes kept too, because the modes without one marker may contain some of them
+MIN_REMAINING_SHARE = 1e-6  # of a mode's square, outside one marker: if less remains, the mode is that marker's alone
+MIN_EXCESS = 0.3  # of a fit's variance: a smaller excess may be chance
+OUTLIER_MEDIANS = 6.0  # residuals are clipped where their square exceeds the square of this times the median square
+MAX_SIGMAS = 3.0  # from the predicted position: a marker farther off moves on its own, or its position is wrong
 
 
-def share_of_noise(grain: Array, residual: Array) -> float:
-    """Share of the fits' standard deviations that is noise: the rest, as dots that are no discs leave, moves with them.
+def noise_fraction(uncorrelated_residual: Array, residual: Array) -> float:
+    """The share of the fits' standard deviations that is noise. The rest moves along with the dots.
 
-    Of what neighbouring pixels' residuals do not share, (D), over all of them, (D). Fits of discs in coded pictures
-    have 0.6 to 1 of it, of dots drawn by hand but for noise 0.45 to 0.55.
+    A dot that is no perfect disc leaves residuals that neighbouring pixels share. In compressed frames, the part of the
+    residual that they do not share is 0.6 to 1 of the whole for discs, and 0.45 to 0.55 for hand-drawn dots almost
+    without noise.
+
+    Args:
+        uncorrelated_residual: root mean square of the part that neighbouring pixels do not share, (D).
+        residual: root mean square of the whole, (D).
     """
-    share = np.divide(grain, residual, out=np.ones_like(grain), where=residual > 0.0)
-    return float(np.clip(np.median(share) / LEAST_GRAIN, SMOOTHEST, 1.0)) ** 2
+    share = np.divide(uncorrelated_residual, residual, out=np.ones_like(uncorrelated_residual), where=residual > 0.0)
+    return float(np.clip(np.median(share) / MIN_UNCORRELATED_SHARE, MIN_NOISE_FRACTION, 1.0)) ** 2
 
 
-def places_and_errors(
-    pixel: Array, fitted: Array, leverage: Array, step: Array, lag: Array, noise: float
+def filtered_positions(
+    pixel: Array, fit_sigma: Array, noise_gain: Array, step: Array, lag_factor: Array, noise: float
 ) -> tuple[Array, Array]:
-    """The markers' places and standard deviations [px], (T, D, 2) each, after all frames have been seen.
+    """The markers' positions and standard deviations [px], (T, D, 2) each, after all frames have been seen.
 
-    Places change only where the pictures were coded with known steps: there a marker is drawn towards where the
-    others' motion puts it, by as much as the coding's errors and the body's own irregular motion call for.
+    Positions change only if the quantisation steps are known. Each marker is then moved towards the position that the
+    other markers' motion predicts. The weight follows from the compression error and the marker's own irregular motion.
 
     Args:
         pixel: paths as fitted [px], (T, D, 2), NaN where not seen.
-        fitted: standard deviations from the fits [px], (T, D, 2).
-        leverage: what a grey level of independent noise in every pixel moves a centre by [px], (T, D, 2), NaN where
-            not known.
-        step: by which the picture was rounded there [grey levels], (T, D), NaN where not known: as in other frames.
-        lag: so many times coarser than these steps each frame is where nothing moves fast, (T).
-        noise: share of `fitted` that is noise, see `share_of_noise`.
+        fit_sigma: standard deviations from the fits [px], (T, D, 2).
+        noise_gain: standard deviation of a fitted centre for independent noise of one grey level in each pixel
+            [px / grey level], (T, D, 2), NaN where not known.
+        step: quantisation step at the marker [grey levels], (T, D). NaN where not known: as in other frames.
+        lag_factor: by which the encoder preset makes slow motion coarser than the step says, in each frame, (T).
+        noise: share of `fit_sigma` that is noise, see `noise_fraction`.
     """
-    known = everywhere(step)
-    haste = harm_of_haste(pixel, leverage, known, lag)
-    shown = fitted * noise if np.isfinite(step).any() else fitted
-    coding = coding_errors(pixel, shown, leverage, haste * known)
-    expected = np.maximum(fitted, coding)
-    others = Others.of(pixel, np.maximum(shown, PASSING * coding))
-    if others is None:
-        return pixel, expected
-    if not others.are_many:
-        return pixel, with_shared_errors(expected, others)
-    off, mended = mendable(pixel, shown, coding, others, step_over_noise(shown, leverage, step) * haste)
-    if np.isnan(mended).any():
-        mended = np.where(np.isnan(mended), with_shared_errors(expected, others), mended)
-    return pixel - off, mended
+    known_step = fill_unknown_steps(step)
+    preset_factor = preset_factors(pixel, noise_gain, known_step, lag_factor)
+    noise_sigma = fit_sigma * noise if np.isfinite(step).any() else fit_sigma
+    compression = compression_errors(pixel, noise_sigma, noise_gain, preset_factor * known_step)
+    sigma = np.maximum(fit_sigma, compression)
+    prediction = LowRankPrediction.of(pixel, np.maximum(noise_sigma, MODE_ERRORS * compression))
+    if prediction is None:
+        return pixel, sigma
+    if not prediction.can_correct:
+        return pixel, add_unmodelled_error(sigma, prediction)
+    coarseness = step_to_noise_ratio(noise_sigma, noise_gain, step) * preset_factor
+    correction, corrected_sigma = compression_correction(pixel, noise_sigma, compression, prediction, coarseness)
+    if np.isnan(corrected_sigma).any():
+        uncorrected = np.isnan(corrected_sigma)
+        corrected_sigma = np.where(uncorrected, add_unmodelled_error(sigma, prediction), corrected_sigma)
+    return pixel - correction, corrected_sigma
 
 
-def everywhere(step: Array) -> Array:
-    """Steps as told, and where not, as they usually are at that marker, or at all, (T, D)."""
-    told = np.isfinite(step)
-    square = np.nansum(step**2, axis=0) / np.maximum(told.sum(axis=0), 1)
-    usual = np.where(told.any(axis=0), square, np.nansum(step**2) / max(told.sum(), 1)) ** 0.5
-    return np.where(told, step, usual)
+def fill_unknown_steps(step: Array) -> Array:
+    """Quantisation steps (T, D); an unknown one is the marker's root mean square, or that of all markers."""
+    known = np.isfinite(step)
+    square = np.nansum(step**2, axis=0) / np.maximum(known.sum(axis=0), 1)
+    usual = np.where(known.any(axis=0), square, np.nansum(step**2) / max(known.sum(), 1)) ** 0.5
+    return np.where(known, step, usual)
 
 
-def square_of_way(pixel: Array) -> Array:
-    """Square of the way to this frame or to the next, the longer [px^2], (T, D); 0 where neither is known."""
+def squared_displacement(pixel: Array) -> Array:
+    """Squared displacement from the last or to the next frame, the larger [px^2], (T, D); 0 where neither is known."""
     x, y = np.moveaxis(np.diff(pixel, axis=0), 2, 0)
-    way = np.pad(x**2 + y**2, ((1, 1), (0, 0)), constant_values=np.nan)
-    return np.nan_to_num(np.fmax(way[:-1], way[1:]))
+    square = np.pad(x**2 + y**2, ((1, 1), (0, 0)), constant_values=np.nan)
+    largest: Array = np.nan_to_num(np.fmax(square[:-1], square[1:]))
+    return largest
 
 
-def harm_of_haste(pixel: Array, leverage: Array, step: Array, lag: Array) -> Array:
-    """How much coarser frames are at each marker than by their steps alone, (T, D).
+def preset_factors(pixel: Array, noise_gain: Array, step: Array, lag_factor: Array) -> Array:
+    """Factor on the quantisation step that accounts for the encoder preset, in each frame and at each marker, (T, D).
 
-    An encoder in a hurry lets slow motion lag, most in frames that it makes of those before and after, but not fast
-    motion. Arguments as for `places_and_errors`, steps known everywhere.
+    A fast preset lets slow motion lag, most in frames predicted from those before and after (B frames). Fast motion
+    does not lag. Arguments as in `filtered_positions`, with all steps known.
     """
-    if (lag == 1.0).all():
+    if (lag_factor == 1.0).all():
         return np.ones(step.shape)
-    rounded = np.nan_to_num(leverage) * (lag[:, None] * step)[..., None]
-    slow = FAST**2 * ((LAGGING * rounded**POWER) ** 2).mean(axis=2)
-    return 1.0 + (lag[:, None] - 1.0) * slow / np.maximum(slow + square_of_way(pixel), 1e-12)
+    noise_error = np.nan_to_num(noise_gain) * (lag_factor[:, None] * step)[..., None]
+    slow = FAST_ERRORS**2 * ((LAG_COEFFICIENT * noise_error**LAG_EXPONENT) ** 2).mean(axis=2)
+    factors: Array = 1.0 + (lag_factor[:, None] - 1.0) * slow / np.maximum(slow + squared_displacement(pixel), 1e-12)
+    return factors
 
 
-def coding_errors(pixel: Array, fitted: Array, leverage: Array, step: Array) -> Array:
-    """Standard deviations (T, D, 2) that the coding of the pictures leads one to expect [px]; 0 where nothing is known.
+def compression_errors(pixel: Array, noise_sigma: Array, noise_gain: Array, step: Array) -> Array:
+    """Expected standard deviations of the compression error [px], (T, D, 2); 0 where nothing is known.
 
-    An encoder passes over changes below its step: a dot that moves a little stays where it was, and the picture it
-    leaves is clean, so that the fit does not show it. It lags along its way, and less along an axis the less of its way
-    lies along that. Arguments as for `places_and_errors`, steps known everywhere and with the harm of haste.
+    An encoder skips changes smaller than its quantisation step. A dot that moves a little then stays where it was,
+    with a clean image, so that the fit does not show the error. The dot lags along its path, and along each axis in
+    proportion to the share of its motion.
+
+    Args:
+        pixel: as in `filtered_positions`.
+        noise_sigma: part of the fits' standard deviations that is noise [px], (T, D, 2).
+        noise_gain: as in `filtered_positions`.
+        step: quantisation steps times `preset_factors`, all known [grey levels], (T, D).
     """
-    rounded = np.nan_to_num(leverage * step[..., None])
-    still = np.where(rounded > 0.0, STILL * np.nan_to_num(fitted), 0.0)
+    noise_error = np.nan_to_num(noise_gain * step[..., None])
+    static = np.where(noise_error > 0.0, STATIC_FACTOR * np.nan_to_num(noise_sigma), 0.0)
     count = np.maximum(np.isfinite(pixel).sum(axis=0), 1)
     mean = np.nansum(pixel, axis=0) / count
     spread = np.nansum((pixel - mean) ** 2, axis=0) / count
-    lagging = np.maximum(LAGGING * rounded**POWER, still)
-    hidden = (still**2).sum(axis=0) / count
-    moves = spread > 4.0 * hidden
-    moves |= (spread > (lagging**2).sum(axis=0) / count).mean(axis=0) > FEW
-    # A marker that hardly seems to move goes the way that the body goes.
-    body, unsure = spread.sum(axis=0), UNDIRECTED * hidden.sum(axis=1, keepdims=True) + 1e-12
-    along = (spread + unsure * body / max(body.sum(), 1e-12)) / (spread.sum(axis=1, keepdims=True) + unsure)
-    lags = np.where(moves.any(axis=1, keepdims=True), along, 0.0)
-    return np.sqrt(still**2 + lags * (lagging**2 - still**2))
+    lag = np.maximum(LAG_COEFFICIENT * noise_error**LAG_EXPONENT, static)
+    static_variance = (static**2).sum(axis=0) / count
+    moves = spread > 4.0 * static_variance
+    moves |= (spread > (lag**2).sum(axis=0) / count).mean(axis=0) > MIN_MOVING_SHARE
+    # The direction of a marker that hardly moves is taken from the body.
+    body, weight = spread.sum(axis=0), BODY_DIRECTION_WEIGHT * static_variance.sum(axis=1, keepdims=True) + 1e-12
+    share = (spread + weight * body / max(body.sum(), 1e-12)) / (spread.sum(axis=1, keepdims=True) + weight)
+    lag_share = np.where(moves.any(axis=1, keepdims=True), share, 0.0)
+    errors: Array = np.sqrt(static**2 + lag_share * (lag**2 - static**2))
+    return errors
 
 
-def step_over_noise(fitted: Array, leverage: Array, step: Array) -> float:
-    """The steps over the noise that the first picture shows, the finest coded; 0 where nothing is known.
+def step_to_noise_ratio(noise_sigma: Array, noise_gain: Array, step: Array) -> float:
+    """Ratio of the quantisation steps to the noise in the first, most finely coded, frame; 0 if nothing is known.
 
-    Noise keeps an encoder from passing over the same change everywhere. Arguments as for `places_and_errors`.
+    Noise keeps an encoder from skipping the same change everywhere. Arguments as in `filtered_positions` and
+    `compression_errors`; unknown steps are NaN.
     """
-    told, noise = np.isfinite(step), fitted / leverage
-    shows = np.flatnonzero(np.isfinite(noise).any(axis=(1, 2)))
-    if not told.any() or not len(shows):
+    known, noise = np.isfinite(step), noise_sigma / noise_gain
+    frames = np.flatnonzero(np.isfinite(noise).any(axis=(1, 2)))
+    if not known.any() or not len(frames):
         return 0.0
-    return float(np.sqrt(np.mean(step[told] ** 2)) / np.nanmedian(noise[shows[0]]))
+    return float(np.sqrt(np.mean(step[known] ** 2)) / np.nanmedian(noise[frames[0]]))
 
 
 @dataclass(frozen=True)
-class Others:
-    """Where the modes in which the other markers move put each marker, itself left out.
+class LowRankPrediction:
+    """Prediction of each marker's path from the few modes in which the other markers move.
 
     Attributes:
         frames: in which all of these markers are seen, (F).
         markers: seen in most frames, (M).
-        away: of the measured places from there [px], (F, M, 2).
-        leverage: share of a place in its own prediction, left out of `away`, (F, M).
-        carried: variance of the predictions by the others' errors, beside that of a place, (M, 2).
+        residual: measured minus predicted positions [px], (F, M, 2).
+        leverage: weight of a position in its own fitted value (diagonal of the regression's hat matrix), (F, M). The
+            `residual` is that of a fit without the position itself.
+        prediction_variance: of the predictions, caused by the other markers' errors [variances of a position], (M, 2).
     """
 
     frames: NDArray[np.int64]
     markers: NDArray[np.int64]
-    away: Array
+    residual: Array
     leverage: Array
-    carried: Array
+    prediction_variance: Array
 
     @classmethod
-    def of(cls, pixel: Array, sigma: Array) -> "Others | None":
-        """Of paths and their standard deviations [px], (T, D, 2); None where too few tell the motion."""
+    def of(cls, pixel: Array, sigma: Array) -> "LowRankPrediction | None":
+        """From paths and their standard deviations [px], (T, D, 2); None if there are too few frames or markers."""
         seen = np.isfinite(sigma[..., 0])
         markers = np.flatnonzero(seen.mean(axis=0) > 0.8)
         frames = np.flatnonzero(seen[:, markers].all(axis=1)) if len(markers) else np.zeros(0, int)
-        if len(frames) < FEW_FRAMES or len(markers) < FEW_MARKERS:
+        if len(frames) < MIN_FRAMES or len(markers) < MIN_MARKERS:
             return None
-        where = _where(frames, markers, pixel)
-        path = pixel[where]
+        index = _index(frames, markers, pixel)
+        path = pixel[index]
         path = (path - path.mean(axis=0)).reshape(len(frames), -1)
         product = path.T @ path
-        noise = (sigma[where] ** 2).mean(axis=0).mean(axis=1)
-        most = min(MODES, len(frames) // 4, len(markers) // 2)
+        noise = (sigma[index] ** 2).mean(axis=0).mean(axis=1)
+        most = min(MAX_MODES, len(frames) // 4, len(markers) // 2)
         square, modes = np.linalg.eigh(product)  # ascending
-        if (len(frames) < FEWEST_FRAMES or len(markers) < FEWEST_MARKERS) and _count_modes(square, len(frames)) > most:
+        few = len(frames) < MIN_FRAMES_TO_CORRECT or len(markers) < MIN_MARKERS_TO_CORRECT
+        if few and _count_modes(square, len(frames)) > most:
             return None
-        square, modes = square[-most - SPARE :], modes[:, -most - SPARE :]
-        squares, mixes = _without_one(square, modes, product)
-        amounts = path @ modes
-        # Up to this size independent errors make modes of their own.
-        by_chance = (noise.sum() - noise) / (len(noise) - 1) * (np.sqrt(len(frames)) + np.sqrt(len(product) - 2)) ** 2
-        away = np.empty((len(frames), len(markers), 2))
-        leverage, carried = np.empty(away.shape[:2]), np.empty((len(markers), 2))
+        square, modes = square[-most - SPARE_MODES :], modes[:, -most - SPARE_MODES :]
+        squares, mixes = _leave_one_out_modes(square, modes, product)
+        amplitudes = path @ modes
+        # Largest square of a mode of independent errors (Marchenko and Pastur).
+        largest_noise = (np.sqrt(len(frames)) + np.sqrt(len(product) - 2)) ** 2
+        threshold = (noise.sum() - noise) / (len(noise) - 1) * largest_noise
+        residual = np.empty((len(frames), len(markers), 2))
+        leverage, prediction_variance = np.empty(residual.shape[:2]), np.empty((len(markers), 2))
         for k in range(len(markers)):
             own = slice(2 * k, 2 * k + 2)
-            count = max(min(most, int((squares[k] > by_chance[k]).sum())), 1)
+            count = max(min(most, int((squares[k] > threshold[k]).sum())), 1)
             size = np.sqrt(np.maximum(squares[k, -count:], 1e-12 * max(squares[k, -1], 1e-12)))
             mix = mixes[k][:, -count:] / size
-            amount = amounts @ mix - path[:, own] @ (modes[own] @ mix)
-            gain = amount.T @ path[:, own]
-            leverage[:, k] = np.minimum((amount**2).sum(axis=1) + 1.0 / len(frames), 1.0 - 1e-9)
-            away[:, k] = (path[:, own] - amount @ gain) / (1.0 - leverage[:, k, None])
-            carried[k] = (gain**2 / size[:, None] ** 2).sum(axis=0)
-        return cls(frames, markers, away, leverage, carried)
+            amplitude = amplitudes @ mix - path[:, own] @ (modes[own] @ mix)
+            gain = amplitude.T @ path[:, own]
+            leverage[:, k] = np.minimum((amplitude**2).sum(axis=1) + 1.0 / len(frames), 1.0 - 1e-9)
+            residual[:, k] = (path[:, own] - amplitude @ gain) / (1.0 - leverage[:, k, None])
+            prediction_variance[k] = (gain**2 / size[:, None] ** 2).sum(axis=0)
+        return cls(frames, markers, residual, leverage, prediction_variance)
 
     @property
-    def are_many(self) -> bool:
-        """Whether places may be mended by them."""
-        return len(self.frames) >= FEWEST_FRAMES and len(self.markers) >= FEWEST_MARKERS
+    def can_correct(self) -> bool:
+        """Whether there are enough frames and markers to correct positions."""
+        return len(self.frames) >= MIN_FRAMES_TO_CORRECT and len(self.markers) >= MIN_MARKERS_TO_CORRECT
 
     @property
-    def missed(self) -> Array:
-        """Mean square of what the others' motion leaves of each path, as if it had not been fitted [px^2], (M, 2)."""
-        return (self.away**2 * (1.0 - self.leverage[..., None])).mean(axis=0)
+    def mean_square(self) -> Array:
+        """Mean square of the residuals, without the effect of the fit itself [px^2], (M, 2)."""
+        mean_square: Array = (self.residual**2 * (1.0 - self.leverage[..., None])).mean(axis=0)
+        return mean_square
 
 
-def _where(frames: NDArray[np.int64], markers: NDArray[np.int64], whole: Array) -> tuple[Any, ...]:
-    """Index of these frames and markers of an array (T, D, ...), which copies nothing where they are all there are."""
+def _index(frames: NDArray[np.int64], markers: NDArray[np.int64], whole: Array) -> tuple[Any, ...]:
+    """Index of these frames and markers in an array (T, D, ...). It makes no copy if they are all there are."""
     if (len(frames), len(markers)) == whole.shape[:2]:
         return slice(None), slice(None)
     return np.ix_(frames, markers)
 
 
 def _count_modes(square: Array, frames: int) -> int:
-    """How many modes of these squares (ascending, (2 M)) stand out, if half of them are noise.
+    """Number of modes above the noise, from their squares (ascending, (2 M)), if at least half of them are noise.
 
-    Squares of noise have Marchenko and Pastur's distribution, whose median is nearly 1 - 0.35 times the matrix's ratio.
+    The squares of noise follow the distribution of Marchenko and Pastur. Its median is about 1 - 0.35 times the
+    matrix's aspect ratio.
     """
     long, short = max(frames - 1, len(square)), min(frames - 1, len(square))
     noise = float(np.median(square[-short:])) / (long - 0.35 * short)
     return int((square > 1.1 * noise * (np.sqrt(long) + np.sqrt(short)) ** 2).sum())
 
 
-def _without_one(square: Array, modes: Array, product: Array) -> tuple[Array, Array]:
-    """The modes of all paths but one marker's, for each of them: squares (M, K), ascending, and mixes (M, K, K).
+def _leave_one_out_modes(square: Array, modes: Array, product: Array) -> tuple[Array, Array]:
+    """For each marker, the modes of all the other markers' paths.
 
-    They are Rayleigh and Ritz's best within what the largest modes of all paths span, in which a mix of these says
-    what one of them is. Solving for each marker anew takes a hundred times as long with 300 of them.
+    They are the Rayleigh-Ritz approximation within the span of the largest modes of all paths. Solving anew for each
+    marker takes a hundred times as long with 300 markers.
 
     Args:
-        square: of the amounts of the largest modes, (K).
-        modes: (2 M, K).
-        product: of all paths, (2 M, 2 M).
+        square: sum of squares of the amplitudes of the largest modes of all paths, (K).
+        modes: these modes, (2 M, K).
+        product: paths' matrix of inner products, (2 M, 2 M).
+
+    Returns:
+        The modes' squares (M, K), ascending, and their coefficients (M, K, K) in terms of `modes`.
     """
     own = modes.reshape(-1, 2, len(square))
-    turned = own.transpose(0, 2, 1)
-    cross = turned @ (own * square)
-    mine = np.stack([product[k : k + 2, k : k + 2] for k in range(0, len(product), 2)])
-    inner = np.diag(square) - cross - cross.transpose(0, 2, 1) + turned @ mine @ own
-    left, axes = np.linalg.eigh(np.eye(len(square)) - turned @ own)
-    axes = axes / np.sqrt(np.where(left > VANISHED, left, np.inf))[:, None]
+    transposed = own.transpose(0, 2, 1)
+    cross = transposed @ (own * square)
+    own_product = np.stack([product[k : k + 2, k : k + 2] for k in range(0, len(product), 2)])
+    inner = np.diag(square) - cross - cross.transpose(0, 2, 1) + transposed @ own_product @ own
+    remaining, axes = np.linalg.eigh(np.eye(len(square)) - transposed @ own)
+    axes = axes / np.sqrt(np.where(remaining > MIN_REMAINING_SHARE, remaining, np.inf))[:, None]
     squares, mixes = np.linalg.eigh(axes.transpose(0, 2, 1) @ inner @ axes)
     return squares, axes @ mixes
 
 
-def with_shared_errors(sigma: Array, others: Others) -> Array:
-    """Standard deviations (T, D, 2) that also hold what a marker's path has beyond the errors `sigma` so far [px].
+def add_unmodelled_error(sigma: Array, prediction: LowRankPrediction) -> Array:
+    """Standard deviations [px], (T, D, 2), that include the part of the prediction's residuals that `sigma` lacks.
 
-    A few places that are far off tell of themselves only.
+    A few positions with large residuals change only their own standard deviations.
     """
-    where = _where(others.frames, others.markers, sigma)
-    own = (sigma[where] ** 2).mean(axis=0)
-    square = others.away**2 * (1.0 - others.leverage[..., None])
-    near = np.minimum(square, OUTLYING**2 * np.median(square, axis=0))
-    beyond = near.mean(axis=0) / (1.0 + others.carried) - own
-    excess = np.where(beyond > TELLING * own, beyond, 0.0)
+    index = _index(prediction.frames, prediction.markers, sigma)
+    own = (sigma[index] ** 2).mean(axis=0)
+    square = prediction.residual**2 * (1.0 - prediction.leverage[..., None])
+    clipped = np.minimum(square, OUTLIER_MEDIANS**2 * np.median(square, axis=0))
+    beyond = clipped.mean(axis=0) / (1.0 + prediction.prediction_variance) - own
+    excess = np.where(beyond > MIN_EXCESS * own, beyond, 0.0)
     added = np.zeros((sigma.shape[1], 2))
     added[:] = np.median(excess, axis=0)
-    added[others.markers] = excess
-    whole = np.sqrt(sigma**2 + added)
-    whole[where] = np.maximum(whole[where], np.sqrt(square) / SURPRISING)
-    return whole
+    added[prediction.markers] = excess
+    total: Array = np.sqrt(sigma**2 + added)
+    total[index] = np.maximum(total[index], np.sqrt(square) / MAX_SIGMAS)
+    return total
 
 
-def mendable(pixel: Array, fitted: Array, coding: Array, others: Others, coarse: Array) -> tuple[Array, Array]:
-    """What of the places is coding's error, by the others' motion, and standard deviations without it [px], (T, D, 2).
+def compression_correction(
+    pixel: Array, noise_sigma: Array, compression: Array, prediction: LowRankPrediction, coarseness: Array
+) -> tuple[Array, Array]:
+    """The part of the positions that is compression error, and standard deviations without it [px], (T, D, 2) each.
 
-    The best mean of two places of known variances, the measured one and the others'. Zero and NaN where nothing is
-    known of the coding. What all markers have in common cannot be seen, and stays.
+    The corrected position is the weighted mean of the measured and the predicted one, by their variances. The error
+    that all markers share cannot be seen, and stays. Where nothing is known of the compression, the correction is zero
+    and the standard deviation NaN.
 
     Args:
         pixel: paths as fitted [px], (T, D, 2).
-        fitted: standard deviations from the fits [px], (T, D, 2).
-        coding: those by coding [px], (T, D, 2).
-        others: motion of these paths.
-        coarse: as `step_over_noise` has it, times the harm of haste, (T, D).
+        noise_sigma: part of the fits' standard deviations that is noise [px], (T, D, 2).
+        compression: standard deviations of the compression error [px], (T, D, 2).
+        prediction: of these paths.
+        coarseness: `step_to_noise_ratio` times `preset_factors`, (T, D).
     """
-    where = _where(others.frames, others.markers, pixel)
-    square, shown = coding[where] ** 2, fitted[where] ** 2
+    index = _index(prediction.frames, prediction.markers, pixel)
+    square, noise = compression[index] ** 2, noise_sigma[index] ** 2
     usual = np.maximum(square.mean(axis=0), 1e-12).sum(axis=1, keepdims=True)
-    way = square_of_way(pixel)[where][..., None]
-    waiting = usual / (usual + np.maximum(way - usual, 0.0) / SLOW**2)  # 1 where a marker keeps still, 0 where it flies
-    calm = STILL * np.sqrt(shown / np.maximum(square, 1e-12))
-    alone = 1.0 / (1.0 + SHARED * coarse[where][..., None] * calm * np.exp(WAITING * waiting))
-    # What the others do not tell of the body's motion, and what their errors make of their prediction.
-    carried = others.carried + (others.leverage / (1.0 - others.leverage))[..., None]
+    displacement = squared_displacement(pixel)[index][..., None]
+    stillness = usual / (usual + np.maximum(displacement - usual, 0.0) / SLOW_ERRORS**2)  # 1 still, 0 fast
+    static_share = STATIC_FACTOR * np.sqrt(noise / np.maximum(square, 1e-12))
+    shared_ratio = SHARED_RATIO * coarseness[index][..., None] * static_share * np.exp(TURNING_EXPONENT * stillness)
+    own_share = 1.0 / (1.0 + shared_ratio)
+    leverage = prediction.leverage
+    prediction_variance = prediction.prediction_variance + (leverage / (1.0 - leverage))[..., None]
 
-    # Variances of a marker's own errors, of those it shares, and of the others' prediction.
-    hidden = np.maximum(square - shown, 0.0)
-    own, shared = np.where(square > 0.0, shown + alone * hidden, 0.0), (1.0 - alone) * hidden
-    least = carried * (shown + hidden).mean(axis=0)
-    beyond = np.maximum(others.missed - own.mean(axis=0), 0.0)
-    part = own / np.maximum(own + np.maximum(beyond, least), (others.away / SURPRISING) ** 2)
-    # Where the others leave less of all paths together than these errors would be, the errors are smaller; but for
-    # markers that keep still, whose errors keep still with them and are not seen.
-    left = (others.missed / (1.0 + others.carried)).mean(axis=0)
-    smaller = np.minimum(left / np.maximum(own.mean(axis=0).mean(axis=0), 1e-12), 1.0)
-    smaller = waiting + (1.0 - waiting) * smaller
-    # What a path has beyond them may be its own motion, where it was drawn away from it, or error, where it was not.
-    kept = (1.0 - part) ** 2 * (smaller * own + beyond)
-    rest = smaller * shared + kept + part**2 * np.maximum(beyond, smaller * least)
-    # A place that stays farther from where the others put it may be error as well.
-    rest = np.maximum(rest, ((1.0 - part) * others.away / SURPRISING) ** 2)
-    off, mended = np.zeros(pixel.shape), np.full(pixel.shape, np.nan)
-    off[where], mended[where] = part * others.away, np.where(square > 0.0, np.sqrt(rest), np.nan)
-    return off, mended
+    # Variances: of a marker's own errors, of those that all share, and the least of the prediction.
+    unseen = np.maximum(square - noise, 0.0)
+    own, shared = np.where(square > 0.0, noise + own_share * unseen, 0.0), (1.0 - own_share) * unseen
+    least = prediction_variance * (noise + unseen).mean(axis=0)
+    beyond = np.maximum(prediction.mean_square - own.mean(axis=0), 0.0)  # of the marker's own motion
+    weight = own / np.maximum(own + np.maximum(beyond, least), (prediction.residual / MAX_SIGMAS) ** 2)
+    # If the residuals of all paths together are smaller than the expected errors, the errors are smaller too. This does
+    # not hold for markers that keep still: their errors are constant, and leave no residuals.
+    left = (prediction.mean_square / (1.0 + prediction.prediction_variance)).mean(axis=0)
+    reduction = np.minimum(left / np.maximum(own.mean(axis=0).mean(axis=0), 1e-12), 1.0)
+    reduction = stillness + (1.0 - stillness) * reduction
+    # The residual may be the marker's own motion, from which the correction moved it away, or error that remains.
+    kept = (1.0 - weight) ** 2 * (reduction * own + beyond)
+    variance = reduction * shared + kept + weight**2 * np.maximum(beyond, reduction * least)
+    # A corrected position that is still far from the predicted one may be wrong as well.
+    variance = np.maximum(variance, ((1.0 - weight) * prediction.residual / MAX_SIGMAS) ** 2)
+    correction, corrected_sigma = np.zeros(pixel.shape), np.full(pixel.shape, np.nan)
+    correction[index] = weight * prediction.residual
+    corrected_sigma[index] = np.where(square > 0.0, np.sqrt(variance), np.nan)
+    return correction, corrected_sigma

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import curled, grid, picture
+from support import curled_strip, marker_grid, draw_frame
 
 from rafl.common.errors import InputError
 from rafl.tracking.linking.follow import PixelTracks, follow
@@ -39,7 +39,7 @@ class Drawn:
             blobs = self.blobs if frame >= 5 else ()
             dots = [(x, y, self.radius, self.radius, 0.0) for x, y in (*shown, *blobs) if np.isfinite(x)]
             options = {"blur": self.blur, "noise": self.noise, "contrast": self.contrast}
-            lit = picture(dots, SIZE, seed=frame, **options) * self.light(frame)
+            lit = draw_frame(dots, SIZE, seed=frame, **options) * self.light(frame)
             yield Frame(0.01 * frame, np.clip(np.rint(lit), 0, 255).astype(np.uint8))
 
 
@@ -67,7 +67,7 @@ def distances(tracks: PixelTracks, truth: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("radius", "blur"), [(2.8, 1.5), (4.0, 2.2)])
 def test_small_blurred_dots_are_tracked(radius: float, blur: float) -> None:
     """The images do not determine radius, contrast and blur of such dots separately."""
-    truth = bent(grid(), 20.0 * np.cos(2 * np.pi * np.arange(16) / 7.3))
+    truth = bent(marker_grid(), 20.0 * np.cos(2 * np.pi * np.arange(16) / 7.3))
     tracks = track(Drawn(truth, radius=radius, blur=blur, noise=4.0))
     assert tracks.pixel.shape == truth.shape
     distance = distances(tracks, truth)
@@ -78,7 +78,7 @@ def test_small_blurred_dots_are_tracked(radius: float, blur: float) -> None:
 @pytest.mark.parametrize(("radius", "noise"), [(5.0, 8.0), (8.0, 10.0)])
 def test_dim_dots_in_noise_are_tracked(radius: float, noise: float) -> None:
     """The contrast is four or five times the pixel noise. So a disc's residual says little about its fit."""
-    truth = bent(grid(), 20.0 * np.cos(2 * np.pi * np.arange(24) / 7.3))
+    truth = bent(marker_grid(), 20.0 * np.cos(2 * np.pi * np.arange(24) / 7.3))
     tracks = track(Drawn(truth, radius=radius, noise=noise, contrast=40.0))
     assert tracks.pixel.shape == truth.shape
     match = order(tracks.start, truth[0])
@@ -99,7 +99,7 @@ def flicker(frame: int) -> np.ndarray:
 
 @pytest.mark.parametrize("light", [shadow, flicker])
 def test_dots_are_tracked_in_changing_light(light: Callable[[int], np.ndarray]) -> None:
-    truth = bent(grid(), 20.0 * np.cos(2 * np.pi * np.arange(24) / 7.3))
+    truth = bent(marker_grid(), 20.0 * np.cos(2 * np.pi * np.arange(24) / 7.3))
     tracks = track(Drawn(truth, light=light))
     assert tracks.pixel.shape == truth.shape
     distance = distances(tracks, truth)
@@ -110,7 +110,7 @@ def test_dots_are_tracked_in_changing_light(light: Callable[[int], np.ndarray]) 
 @pytest.mark.parametrize("swing", [10.0, 20.0, 30.0])
 def test_swinging_dots_keep_their_identity(swing: float) -> None:
     """The tip moves by up to `swing` px, three quarters of a spacing a frame, in a grid of equal dots."""
-    truth = bent(grid(), swing * np.cos(2 * np.pi * np.arange(24) / 7.3))
+    truth = bent(marker_grid(), swing * np.cos(2 * np.pi * np.arange(24) / 7.3))
     tracks = track(Drawn(truth))
     assert tracks.pixel.shape == truth.shape
     distance = distances(tracks, truth)
@@ -121,7 +121,7 @@ def test_swinging_dots_keep_their_identity(swing: float) -> None:
 @pytest.mark.parametrize(("turn", "height"), [(0.5, 205.0), (-0.5, 20.0)])
 def test_static_dots_beside_a_fast_body_keep_their_identity(turn: float, height: float) -> None:
     """Six static dots lie within a spacing of a tip that moves by one spacing a frame."""
-    swinging = bent(grid(), 34.0 * np.sin(2 * np.pi * np.arange(24) / 6.3 + np.pi * turn)) - np.array([0.0, 5.0])
+    swinging = bent(marker_grid(), 34.0 * np.sin(2 * np.pi * np.arange(24) / 6.3 + np.pi * turn)) - np.array([0.0, 5.0])
     static = np.stack([30.0 + 44.0 * np.arange(6), np.full(6, height)], axis=1)
     truth = np.concatenate([swinging, np.tile(static, (24, 1, 1))], axis=1)
     distance = distances(track(Drawn(truth)), truth)
@@ -130,7 +130,7 @@ def test_static_dots_beside_a_fast_body_keep_their_identity(turn: float, height:
 
 
 def test_hidden_dots_keep_their_identity_when_they_reappear() -> None:
-    truth = bent(grid(), 15.0 * np.sin(2 * np.pi * np.arange(20) / 16))
+    truth = bent(marker_grid(), 15.0 * np.sin(2 * np.pi * np.arange(20) / 16))
     tracks = track(Drawn(truth, hidden=tuple(range(6, 12))))
     found = tracks.pixel[:, order(tracks.start, truth[0])]
     assert np.isnan(found[6:12, :3]).all()
@@ -162,7 +162,7 @@ def test_dots_keep_their_identity_while_a_bar_passes() -> None:
 
     When the most similar shapes identified the markers, two had a neighbour's identity.
     """
-    truth = bent(grid(), 40.0 * np.sin(2 * np.pi * np.arange(60) / 13.1))
+    truth = bent(marker_grid(), 40.0 * np.sin(2 * np.pi * np.arange(60) / 13.1))
     bar = np.linspace(-60.0, 400.0, 60)
     hidden = np.abs(truth[..., 0] - bar[:, None]) < 80.0
     hidden[0] = False
@@ -175,7 +175,7 @@ def test_dots_keep_their_identity_while_a_bar_passes() -> None:
 
 def test_dots_hidden_at_first_are_detected_late() -> None:
     """A hand holds the specimen for fifteen frames. Then it swings, and the dots are tracked once they are visible."""
-    rest = grid()
+    rest = marker_grid()
     rest = np.concatenate([rest[[4, 13, 23]], np.delete(rest, [4, 13, 23], axis=0)])
     truth = bent(rest, np.concatenate([np.zeros(15), 20.0 * np.sin(2 * np.pi * np.arange(55) / 16)]))
     tracks = track(Drawn(truth, hidden=tuple(range(15))))
@@ -190,7 +190,7 @@ def test_dots_hidden_at_first_are_detected_late() -> None:
 
 def test_hidden_columns_with_a_large_spacing_are_detected_late() -> None:
     """In a grid of three rows, the column spacing is 2.5 times the row spacing. The last two columns are hidden."""
-    rest = grid(5, 3) * [1.6, 0.64] - [24.0, -30.0]
+    rest = marker_grid(5, 3) * [1.6, 0.64] - [24.0, -30.0]
     truth = bent(rest, np.concatenate([np.zeros(15), 20.0 * np.sin(2 * np.pi * np.arange(85) / 16)]))
     positions = truth.copy()
     positions[:15, rest[:, 0] > 180.0] = np.nan
@@ -204,7 +204,7 @@ def test_hidden_columns_with_a_large_spacing_are_detected_late() -> None:
 @pytest.mark.parametrize("tip", [25.0, 45.0])
 def test_hidden_dots_beside_the_clamp_are_detected_late(tip: float) -> None:
     """They move by 0.2 to 10 px. The body is bent at first, so the moving markers alone do not give their position."""
-    truth = bent(grid(), tip * np.cos(0.4 * np.arange(90)))
+    truth = bent(marker_grid(), tip * np.cos(0.4 * np.arange(90)))
     positions = truth.copy()
     positions[:20, truth[0, :, 0] < 130.0] = np.nan
     tracks = track(Drawn(positions))
@@ -219,7 +219,7 @@ def test_hidden_dots_beside_the_clamp_are_detected_late(tip: float) -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_irregular_dot_beside_the_clamp_is_detected_late(seed: int) -> None:
     """It moves by 0.1 px, and is in no row, because the dots were placed by hand."""
-    rest = grid() + np.random.default_rng(seed).uniform(-6.0, 6.0, (24, 2))
+    rest = marker_grid() + np.random.default_rng(seed).uniform(-6.0, 6.0, (24, 2))
     truth = bent(rest, 2.4 * np.cos(0.4 * np.arange(90)))
     positions = truth.copy()
     positions[:20, 1] = np.nan
@@ -231,7 +231,7 @@ def test_irregular_dot_beside_the_clamp_is_detected_late(seed: int) -> None:
 @pytest.mark.parametrize("speed", [0.2, 0.3, 0.4])
 def test_start_of_a_hidden_tip_is_predicted(speed: float) -> None:
     """The hidden part of a strip curls unpredictably at first, but is seen to curl in the same way later."""
-    curls = [curled(0.14 * np.cos(speed * frame)) for frame in range(100)]
+    curls = [curled_strip(0.14 * np.cos(speed * frame)) for frame in range(100)]
     truth = np.array(curls) + np.array([60.0, 118.0])
     positions = truth.copy()
     positions[:15, 6:] = np.nan
@@ -248,7 +248,7 @@ def test_start_of_a_hidden_tip_is_predicted(speed: float) -> None:
 @pytest.mark.parametrize("speed", [0.6, 0.65, 0.7])
 def test_fast_tip_hidden_at_first_is_detected_late(speed: float) -> None:
     """It moves nearly three spacings a frame; its estimated position on the body varies by about one spacing."""
-    truth = np.array([curled(0.2 * np.cos(speed * frame)) for frame in range(90)]) + np.array([60.0, 118.0])
+    truth = np.array([curled_strip(0.2 * np.cos(speed * frame)) for frame in range(90)]) + np.array([60.0, 118.0])
     positions = truth.copy()
     positions[:20, 8:] = np.nan
     tracks = track(Drawn(positions))
@@ -261,7 +261,7 @@ def test_fast_tip_hidden_at_first_is_detected_late(speed: float) -> None:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_many_background_blobs_are_not_tracked(seed: int) -> None:
     """They are so many that some blob is always at a position to which the swinging body could have carried it."""
-    truth = bent(grid(), 30.0 * np.sin(2 * np.pi * np.arange(80) / 23))
+    truth = bent(marker_grid(), 30.0 * np.sin(2 * np.pi * np.arange(80) / 23))
     random, blobs = np.random.default_rng(seed), np.empty((0, 2))
     while len(blobs) < 24:
         blob = random.uniform([8.0, 8.0], [350.0, 230.0])
@@ -277,7 +277,7 @@ def test_many_background_blobs_are_not_tracked(seed: int) -> None:
 @pytest.mark.parametrize("period", [10, 35, 160])
 def test_background_blobs_behind_the_body_are_not_tracked(period: int) -> None:
     """The swinging body returns to them again and again, or moves away from them slowly."""
-    truth = bent(grid(), 20.0 * np.sin(2 * np.pi * np.arange(100) / period))
+    truth = bent(marker_grid(), 20.0 * np.sin(2 * np.pi * np.arange(100) / period))
     blobs = ((20.0, 40.0), (160.0, 40.0), (330.0, 100.0), (330.0, 180.0), (100.0, 195.0), (220.0, 210.0))
     assert track(Drawn(truth, blobs=blobs)).late_count == 0
 
@@ -285,7 +285,7 @@ def test_background_blobs_behind_the_body_are_not_tracked(period: int) -> None:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_background_blobs_that_shake_with_the_camera_are_not_tracked(seed: int) -> None:
     """They appear late beside the clamp, where the body shakes in the same way."""
-    truth = bent(grid(), 25.0 * np.sin(2 * np.pi * np.arange(80) / 25))
+    truth = bent(marker_grid(), 25.0 * np.sin(2 * np.pi * np.arange(80) / 25))
     blobs = np.tile([[12.0, 55.0], [10.0, 100.0], [16.0, 135.0], [30.0, 215.0], [50.0, 30.0]], (80, 1, 1))
     blobs[:5] = np.nan
     shake = np.random.default_rng(seed).normal(0.0, 0.45, (80, 1, 2))
@@ -293,7 +293,7 @@ def test_background_blobs_that_shake_with_the_camera_are_not_tracked(seed: int) 
 
 
 def test_frames_before_the_first_dots_are_missing() -> None:
-    truth = np.concatenate([np.full((4, 24, 2), np.nan), np.repeat(grid()[None], 3, axis=0)])
+    truth = np.concatenate([np.full((4, 24, 2), np.nan), np.repeat(marker_grid()[None], 3, axis=0)])
     tracks = track(Drawn(truth))
     assert np.isnan(tracks.pixel[:4]).all()
     assert not tracks.damaged.any()
@@ -302,4 +302,4 @@ def test_frames_before_the_first_dots_are_missing() -> None:
 
 def test_too_few_dots_raise() -> None:
     with pytest.raises(InputError, match=r"drawn\.mp4: expected at least 3 dots .* found 2"):
-        track(Drawn(grid(2, 1)[None]))
+        track(Drawn(marker_grid(2, 1)[None]))

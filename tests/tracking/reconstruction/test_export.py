@@ -1,4 +1,4 @@
-"""Every export read back by a reader of its own kind."""
+"""Each export is read back by an independent reader of its format."""
 
 from pathlib import Path
 
@@ -6,6 +6,7 @@ import ezc3d
 import numpy as np
 import pandas as pd
 import pytest
+
 from rafl.tracking.reconstruction.export import write_c3d, write_csv, write_npy, write_trc
 from rafl.tracking.reconstruction.tracks import Tracks
 
@@ -25,8 +26,8 @@ def test_csv(tracks: Tracks, tmp_path: Path) -> None:
     write_csv(tmp_path / "a.csv", tracks)
     table = pd.read_csv(tmp_path / "a.csv")
     assert len(table) == 18
-    back = table[["x_mm", "y_mm", "z_mm"]].to_numpy().reshape(6, 3, 3)
-    np.testing.assert_allclose(1e-3 * back, tracks.position, rtol=1e-5)
+    positions = table[["x_mm", "y_mm", "z_mm"]].to_numpy().reshape(6, 3, 3)
+    np.testing.assert_allclose(1e-3 * positions, tracks.position, rtol=1e-5)
     assert table.state.tolist()[7] == "missing"
     assert table.marker.tolist()[:3] == list(tracks.names)
     np.testing.assert_allclose(table.sigma_x_mm.dropna(), 0.02)

@@ -1,8 +1,9 @@
 import numpy as np
+
 from rafl.tracking.reconstruction.gap_filling import fill_gaps
 
 
-def test_short_gaps_are_filled_and_long_ones_left() -> None:
+def test_only_short_gaps_are_filled() -> None:
     time = 0.01 * np.arange(40)
     truth = np.stack([np.sin(20 * time), np.cos(15 * time), time], axis=-1)[:, None]
     position, sigma = truth.copy(), np.full((40, 1, 3), 1e-4)
@@ -17,15 +18,15 @@ def test_short_gaps_are_filled_and_long_ones_left() -> None:
     assert np.isnan(filled[20:30]).all()
 
 
-def test_a_hidden_marker_moves_as_its_neighbours_do() -> None:
-    """A swing of 30 mm at 9 Hz, 5 frames hidden across its turning point: a cubic in time is off by millimetres."""
+def test_a_hidden_marker_is_predicted_from_the_others() -> None:
+    """An oscillation of 30 mm at 9 Hz is hidden for 5 frames at its reversal, where a cubic is millimetres off."""
     time = 0.01 * np.arange(120)
-    place = np.linspace(0.2, 1.0, 8)
+    along = np.linspace(0.2, 1.0, 8)
     swing = 0.03 * np.sin(2 * np.pi * 9.1 * time) * np.exp(-2 * time)
     ripple = 0.002 * np.sin(2 * np.pi * 31 * time)
     truth = np.zeros((120, 8, 3))
-    truth[..., 0] = 0.1 * place - 0.5 * (swing[:, None] * place) ** 2 / 0.1
-    truth[..., 2] = swing[:, None] * place**2 + ripple[:, None] * np.sin(4 * place)
+    truth[..., 0] = 0.1 * along - 0.5 * (swing[:, None] * along) ** 2 / 0.1
+    truth[..., 2] = swing[:, None] * along**2 + ripple[:, None] * np.sin(4 * along)
     random = np.random.default_rng(0)
     position = truth + random.normal(0, 2e-6, truth.shape)
     sigma = np.full(truth.shape, 2e-6)
@@ -38,7 +39,7 @@ def test_a_hidden_marker_moves_as_its_neighbours_do() -> None:
 
 
 def strip(random: np.random.Generator, frames: int) -> np.ndarray:
-    """Five pairs of markers on a strip that curls to and fro, 40 apart (T, 10, 3); the last pair is its tip."""
+    """Five pairs of markers (T, 10, 3), 40 apart, on a strip that curls to and fro; the last pair is its tip."""
     time, along = np.arange(frames), np.linspace(0.0, 1.0, 400)
     slow, fast = (np.sin(2 * np.pi * rate * time + random.uniform(0, 6)) for rate in (0.07, 0.19))
     slope = 0.8 * slow[:, None] * (2 * along - along**2) + 0.1 * fast[:, None] * np.sin(2.5 * np.pi * along) * along
@@ -49,8 +50,8 @@ def strip(random: np.random.Generator, frames: int) -> np.ndarray:
     return np.concatenate([pairs.reshape(frames, 10, 2), np.zeros((frames, 10, 1))], axis=2)
 
 
-def test_who_is_seen_in_a_gap_tells_though_not_beside_it() -> None:
-    """The tip is hidden for five frames, the marker beside it in the frame before: in the gap it shows the way."""
+def test_a_marker_seen_in_the_gap_is_used_though_hidden_before_it() -> None:
+    """One marker of the tip is hidden for five frames, the other one only in the frame before."""
     worst = []
     for seed in range(20):
         random = np.random.default_rng(seed)
@@ -63,8 +64,8 @@ def test_who_is_seen_in_a_gap_tells_though_not_beside_it() -> None:
     assert max(worst) < 0.15
 
 
-def test_a_filled_place_is_as_well_known_as_sigma_says() -> None:
-    """No better than a measured one; and where all of a tip is hidden, much worse."""
+def test_sigma_of_filled_positions_matches_their_errors() -> None:
+    """It is no smaller than a measured position's, and much larger if the whole tip is hidden."""
     random = np.random.default_rng(0)
     for hidden, least, most in (([4], 1.0, 1.5), ([8, 9], 2.0, 12.0)):
         errors, sigmas = [], []

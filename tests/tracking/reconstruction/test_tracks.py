@@ -4,10 +4,10 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
-from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
-from rafl.tracking.report import summary_cells
 
 from rafl.common.errors import InputError
+from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
+from rafl.tracking.report import summary_cells
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def tracks(random: np.random.Generator) -> Tracks:
         pixel_sigma={"left": np.full((*shape, 2), 0.02)},
         damaged={"left": np.zeros(7, dtype=bool)},
         frame={"left": np.array([0, 1, 2, -1, 3, 4, 5])},
-        pictures={"left": {0: b"first", 5: b"worst"}},
+        images={"left": {0: b"first", 5: b"worst"}},
         fps=100.0,
         calibration="format: rafl-calibration/1",
         sources={"videos/a  b/left.mp4": "0123abcd"},
@@ -45,12 +45,12 @@ def test_round_trip(tracks: Tracks, tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(back, key), getattr(tracks, key))
     for key in ("pixel", "residual", "pixel_sigma", "damaged"):
         np.testing.assert_array_equal(getattr(back, key)["left"], getattr(tracks, key)["left"])
-    for key in ("names", "fps", "calibration", "sources", "settings", "notes", "pictures", "version"):
+    for key in ("names", "fps", "calibration", "sources", "settings", "notes", "images", "version"):
         assert getattr(back, key) == getattr(tracks, key)
 
 
-def test_only_markers_that_two_cameras_see_have_a_residual(tracks: Tracks) -> None:
-    """A marker that one camera alone sees lies in its plane, and just where that camera sees it."""
+def test_residuals_count_only_markers_seen_by_two_cameras(tracks: Tracks) -> None:
+    """A marker that one camera alone sees is placed exactly where that camera sees it, so its residual is 0."""
     assert summary_cells(tracks) == ["7", "4", "92.9%", "3.6%", "3.6%", "0.020", "-"]
     right = np.full((7, 4), np.nan)
     right[:, 2] = 0.3

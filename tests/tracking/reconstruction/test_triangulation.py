@@ -2,11 +2,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+
 from rafl.calibration.camera import OrthographicCamera, PinholeCamera, Plane
 from rafl.calibration.rig import Rig
-from rafl.tracking.reconstruction.triangulation import CameraPixels, at_times, triangulate
-
 from rafl.common.errors import InputError
+from rafl.tracking.reconstruction.triangulation import CameraPixels, resample_pixels, triangulate
 
 SIDE = OrthographicCamera(
     image_size=(1280, 720),
@@ -18,8 +18,8 @@ SIDE = OrthographicCamera(
 ABOVE = replace(SIDE, rotation_vector=(np.pi, 0.0, 0.0), plane=None, distortion=(5e-3, 0.0))
 
 
-def seen(camera: OrthographicCamera, points: np.ndarray, sigma: float = 0.02, noise: float = 0.0) -> CameraPixels:
-    random = np.random.default_rng(int(any(camera.distortion)))  # another noise in each camera
+def film(camera: OrthographicCamera, points: np.ndarray, sigma: float = 0.02, noise: float = 0.0) -> CameraPixels:
+    random = np.random.default_rng(int(any(camera.distortion)))  # different noise in each camera
     pixel = camera.project(points) + random.normal(0, noise, (*points.shape[:2], 2))
     return CameraPixels(pixel, np.full(pixel.shape, sigma))
 
@@ -27,34 +27,34 @@ def seen(camera: OrthographicCamera, points: np.ndarray, sigma: float = 0.02, no
 def test_two_cameras_give_exact_points(random: np.random.Generator) -> None:
     points = random.uniform(-0.05, 0.05, (6, 4, 3))
     rig = Rig({"side": SIDE, "above": ABOVE})
-    pixels = {"side": seen(SIDE, points), "above": seen(ABOVE, points)}
+    pixels = {"side": film(SIDE, points), "above": film(ABOVE, points)}
     position, _, residual = triangulate(rig, pixels)
     np.testing.assert_allclose(position, points, atol=1e-9)
     assert max(values.max() for values in residual.values()) < 1e-4
 
 
-def test_sigma_is_the_spread_of_noisy_points(random: np.random.Generator) -> None:
+def test_sigma_is_the_standard_deviation_of_noisy_points(random: np.random.Generator) -> None:
     points = np.broadcast_to(random.uniform(-0.05, 0.05, 3), (4000, 1, 3))
     rig = Rig({"side": SIDE, "above": ABOVE})
-    pixels = {"side": seen(SIDE, points, 0.1, 0.1), "above": seen(ABOVE, points, 0.1, 0.1)}
+    pixels = {"side": film(SIDE, points, 0.1, 0.1), "above": film(ABOVE, points, 0.1, 0.1)}
     position, sigma, _ = triangulate(rig, pixels)
     np.testing.assert_allclose(position.std(axis=0)[0], sigma[0, 0], rtol=0.1)
 
 
-def test_one_camera_puts_a_marker_on_its_plane() -> None:
-    """y = 10 mm is the plane; there sigma is the plane's, across the picture the pixel's."""
+def test_one_camera_places_a_marker_on_its_plane() -> None:
+    """The plane is y = 10 mm. Sigma is the plane's along y, and follows from the pixels along x and z."""
     points = np.array([[[0.02, 0.01, 0.03]]])
-    position, sigma, _ = triangulate(Rig({"side": SIDE}), {"side": seen(SIDE, points)})
+    position, sigma, _ = triangulate(Rig({"side": SIDE}), {"side": film(SIDE, points)})
     np.testing.assert_allclose(position, points, atol=1e-9)
     np.testing.assert_allclose(sigma[0, 0], [0.02 / 6000, 5e-4, 0.02 / 6000], rtol=1e-6)
     bare = replace(SIDE, plane=None)
     with pytest.raises(InputError, match=r"camera side alone .* no plane"):
-        triangulate(Rig({"side": bare}), {"side": seen(bare, points)})
+        triangulate(Rig({"side": bare}), {"side": film(bare, points)})
 
 
 def test_unseen_markers_are_nan() -> None:
     points = np.zeros((2, 1, 3))
-    pixels = seen(SIDE, points)
+    pixels = film(SIDE, points)
     pixels.pixel[1], pixels.sigma[1] = np.nan, np.nan
     position, sigma, residual = triangulate(Rig({"side": SIDE}), {"side": pixels})
     assert np.isfinite(position[0]).all()
@@ -63,45 +63,45 @@ def test_unseen_markers_are_nan() -> None:
     assert np.isnan(residual["side"][1]).all()
 
 
-def test_a_late_camera_is_brought_to_the_rigs_clock() -> None:
-    """A clock 3.7 ms ahead stamps at t what happened at t - 3.7 ms."""
+def test_a_camera_is_resampled_to_the_rigs_clock() -> None:
+    """A clock 3.7 ms ahead gives the time t to what happened at t - 3.7 ms."""
     time = 0.01 * np.arange(50)
 
     def path(t: np.ndarray) -> np.ndarray:
         return np.stack([300 + 40 * np.sin(9 * t), 200 + 30 * np.cos(7 * t)], axis=-1)[:, None]
 
     stamped = CameraPixels(path(time - 0.0037), np.full((50, 1, 2), 0.05))
-    moved = at_times(stamped, time - 0.0037, time)
-    inside = np.isfinite(moved.sigma[:, 0, 0])
+    resampled = resample_pixels(stamped, time - 0.0037, time)
+    inside = np.isfinite(resampled.sigma[:, 0, 0])
     assert inside.sum() >= 48
-    np.testing.assert_allclose(moved.pixel[inside], path(time)[inside], atol=5e-3)
+    np.testing.assert_allclose(resampled.pixel[inside], path(time)[inside], atol=5e-3)
 
 
-def test_frames_that_a_camera_dropped_are_not_invented() -> None:
-    """Between frames more than one apart nothing is interpolated; frames of the same time are taken as they are."""
+def test_dropped_frames_are_not_interpolated() -> None:
+    """Nothing is interpolated across a dropped frame. Frames of the same time are taken unchanged."""
     own = np.delete(0.01 * np.arange(20), [7, 8])
     pixels = CameraPixels(np.ones((18, 1, 2)) * own[:, None, None], np.full((18, 1, 2), 0.05))
-    asked = at_times(pixels, own, 0.01 * np.arange(20))
-    assert np.flatnonzero(np.isnan(asked.pixel[:, 0, 0])).tolist() == [7, 8]
-    np.testing.assert_array_equal(asked.pixel[[0, 6, 9, 19], 0, 0], [0.0, 0.06, 0.09, 0.19])
+    resampled = resample_pixels(pixels, own, 0.01 * np.arange(20))
+    assert np.flatnonzero(np.isnan(resampled.pixel[:, 0, 0])).tolist() == [7, 8]
+    np.testing.assert_array_equal(resampled.pixel[[0, 6, 9, 19], 0, 0], [0.0, 0.06, 0.09, 0.19])
 
 
 ASKEW = replace(SIDE, rotation_vector=(2.0, 0.7, 0.3), plane=None)
 
 
-def test_a_wrong_match_is_left_out_where_others_outvote_it(random: np.random.Generator) -> None:
+def test_an_outlying_camera_is_left_out_if_the_others_agree(random: np.random.Generator) -> None:
     points = random.uniform(-0.03, 0.03, (5, 3, 3))
     rig = Rig({"side": SIDE, "above": ABOVE, "askew": ASKEW})
-    pixels = {name: seen(camera, points) for name, camera in rig.cameras.items()}
+    pixels = {name: film(camera, points) for name, camera in rig.cameras.items()}
     pixels["askew"].pixel[2, 1] += [80.0, -30.0]
     position, _, residual = triangulate(rig, pixels)
     np.testing.assert_allclose(position, points, atol=1e-7)
     assert residual["askew"][2, 1] > 50
 
 
-def test_two_cameras_that_disagree_count_as_not_seen(random: np.random.Generator) -> None:
+def test_a_marker_on_which_two_cameras_disagree_counts_as_not_seen(random: np.random.Generator) -> None:
     points = random.uniform(-0.03, 0.03, (5, 3, 3))
-    pixels = {"side": seen(SIDE, points), "above": seen(ABOVE, points)}
+    pixels = {"side": film(SIDE, points), "above": film(ABOVE, points)}
     pixels["above"].pixel[2, 1] += [80.0, 0.0]
     position, _, _ = triangulate(Rig({"side": SIDE, "above": ABOVE}), pixels)
     assert np.isnan(position[2, 1]).all()
@@ -119,6 +119,6 @@ def test_pinhole_and_orthographic_cameras_together(random: np.random.Generator) 
     )
     points = random.uniform(-0.03, 0.03, (5, 3, 3))
     rig = Rig({"side": SIDE, "near": near})
-    position, sigma, _ = triangulate(rig, {name: seen(camera, points) for name, camera in rig.cameras.items()})
+    position, sigma, _ = triangulate(rig, {name: film(camera, points) for name, camera in rig.cameras.items()})
     np.testing.assert_allclose(position, points, atol=1e-8)
     assert (sigma < 2e-5).all()
