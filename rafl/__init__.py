@@ -1,6 +1,99 @@
-"""Differentiable soft-body simulation, residual acceleration fields, fitting and evaluation."""
+"""From videos of a dotted soft specimen to a physics model that predicts shapes never filmed.
 
+The names below are the public interface. Each is imported when it is first used, so `import rafl` is quick.
+"""
+
+import importlib
 import os
+from typing import TYPE_CHECKING, Any
 
-# A kernel's thread that waits for another spins only briefly: on a busy machine the other may not even run.
+from rafl.common.version import VERSION
+
+if TYPE_CHECKING:
+    from rafl.api import (
+        CaptureSettings,
+        Dataset,
+        FittedModel,
+        HexMesh,
+        InputError,
+        Material,
+        Parameters,
+        ResidualField,
+        ResidualForce,
+        Rig,
+        Simulation,
+        SimulationError,
+        Simulator,
+        Specimen,
+        Start,
+        Tracks,
+        Trajectory,
+        build_dataset,
+        calibrate,
+        evaluate,
+        fit,
+        load_model,
+        predict,
+        read_calibration,
+        read_dataset,
+        read_specimen,
+        read_tracks,
+        rollout,
+        simulate,
+        track,
+        write_calibration,
+        write_dataset,
+        write_tracks,
+    )
+
+__all__ = [
+    "CaptureSettings",
+    "Dataset",
+    "FittedModel",
+    "HexMesh",
+    "InputError",
+    "Material",
+    "Parameters",
+    "ResidualField",
+    "ResidualForce",
+    "Rig",
+    "Simulation",
+    "SimulationError",
+    "Simulator",
+    "Specimen",
+    "Start",
+    "Tracks",
+    "Trajectory",
+    "__version__",
+    "build_dataset",
+    "calibrate",
+    "evaluate",
+    "fit",
+    "load_model",
+    "predict",
+    "read_calibration",
+    "read_dataset",
+    "read_specimen",
+    "read_tracks",
+    "rollout",
+    "simulate",
+    "track",
+    "write_calibration",
+    "write_dataset",
+    "write_tracks",
+]
+
+__version__ = VERSION
+
+# A waiting kernel thread spins only briefly: on a busy machine the thread that it waits for may not be running.
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module 'rafl' has no attribute {name!r}")
+    return getattr(importlib.import_module("rafl.api"), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__all__]

@@ -21,7 +21,7 @@ from rafl.data.dataset_file import read_dataset
 from rafl.evaluation.metrics import (
     Comparison,
     Transfer,
-    compare_those_that_simulate,
+    compare_skipping_failures,
     error_table,
     held_out_errors,
     latex_table,
@@ -31,9 +31,9 @@ from rafl.evaluation.metrics import (
 from rafl.evaluation.report import write_report
 from rafl.fitting.distributed import rank
 from rafl.fitting.fit import fit as fit_model
-from rafl.fitting.methods import EPOCHS
+from rafl.fitting.methods import DEFAULT_EPOCHS
 from rafl.fitting.run_folder import FittedModel, load_model
-from rafl.fitting.sysid import spoken
+from rafl.fitting.sysid import parameter_sentences
 from rafl.fitting.train_field import Report
 
 TORCH_THREADS = 1  # the network is small; the other cores run the element kernels
@@ -62,7 +62,7 @@ def fit(
     first = rank() == 0  # of the processes that torchrun started
     writer = _open_writer(run) if tensorboard and first else None
     with progress() as bar:
-        task = bar.add_task("epoch", total=options["epochs"] or EPOCHS[method])
+        task = bar.add_task("epoch", total=options["epochs"] or DEFAULT_EPOCHS[method])
         report = _epoch_report(bar, task, writer, first)
         notify = partial(typer.echo, err=True)
         try:
@@ -73,7 +73,7 @@ def fit(
         return
     typer.echo(_describe(model))
     if (run / "parameters.csv").exists():
-        for line in spoken(pd.read_csv(run / "parameters.csv")):
+        for line in parameter_sentences(pd.read_csv(run / "parameters.csv")):
             typer.echo(line)
     typer.echo(f"wrote {run}/ (model.pt, history.csv, config.yaml)")
     typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in paths)}")
@@ -130,7 +130,7 @@ def _describe(model: FittedModel) -> str:
         if "viscosity" in model.material:
             identified += f", viscosity = {model.material['viscosity']:.0f} Pa s"
         parts.append(identified)
-    integration = f", time integration {model.stepping['integrator']}" if model.stepping else ""
+    integration = f", time integration {model.time_integration['integrator']}" if model.time_integration else ""
     return " on ".join(parts) + integration
 
 
@@ -164,9 +164,10 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
     transfer = Transfer.of(splits)
     if transfer.errors.shape[1] > 1:
         write_text(folder / "transfer.csv", transfer.errors.to_csv(float_format="%.6f"))
-    for name, count in transfer.negative.items():
+    for name, count in transfer.negative_transfers.items():
+        simulated = transfer.datasets_simulated[name]
         failing = f"; its simulation fails on {failed[name]} more" if name in failed else ""
-        typer.echo(f"{name}: worse than the baseline simulator on {count} of {transfer.tried[name]} datasets{failing}")
+        typer.echo(f"{name}: worse than the baseline simulator on {count} of {simulated} datasets{failing}")
     typer.echo(f"wrote {folder}/errors.csv, motions.csv, errors.tex")
     held_out = held_out_errors(comparisons)
     if held_out:
@@ -199,7 +200,7 @@ def _compare_all(datasets: list[Dataset], models: dict[str, FittedModel]) -> tup
     failed: Counter[str] = Counter()
     with progress() as bar:
         for k, dataset in enumerate(bar.track(datasets, description="simulating")):
-            compared, failures = compare_those_that_simulate(dataset, applicable[k])
+            compared, failures = compare_skipping_failures(dataset, applicable[k])
             comparisons += compared
             for name, error in failures.items():
                 failed[name] += 1

@@ -1,1 +1,1 @@
-"""What every package stands on: errors, files written whole, YAML, the command line's manners."""
+"""Code that all packages share: errors, atomic files, YAML files, the command line, marker tables."""

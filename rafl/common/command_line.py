@@ -1,8 +1,8 @@
-"""What all commands share: how errors are shown, the application's settings, progress bars."""
+"""Code that all commands share: error reports, application settings, progress bars."""
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import ParamSpec, TypeVar
 
 import typer
 from rich.console import Console
@@ -10,32 +10,37 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from rafl.common.errors import InputError
 
-Command = TypeVar("Command", bound=Callable[..., Any])
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
-def user_command(command: Command) -> Command:
-    """Turn an `InputError`, or a file system's refusal, into one line on standard error and exit code 2."""
+def report_errors(command: Callable[P, R]) -> Callable[P, R]:
+    """Wrap a command so that it reports errors in one line on standard error instead of a traceback.
+
+    The exit code is 2 after an `InputError` or an error of the file system, and 130 after an interruption.
+    """
 
     @functools.wraps(command)
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
+    def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
             return command(*args, **kwargs)
         except InputError as error:
             typer.echo(f"error: {error}", err=True)
             raise typer.Exit(2) from None
         except OSError as error:
-            where = error.filename or "a file"
-            typer.echo(f"error: {where}: {error.strerror or error}; check the path, its rights and the disk", err=True)
+            path = error.filename or "a file"
+            reason = error.strerror or error
+            typer.echo(f"error: {path}: {reason}; check the path, its permissions and the disk", err=True)
             raise typer.Exit(2) from None
         except KeyboardInterrupt:
-            typer.echo("stopped; nothing half-written was left behind", err=True)
+            typer.echo("interrupted; no incomplete file was left", err=True)
             raise typer.Exit(130) from None
 
     return wrapped
 
 
-def command_line(help_text: str) -> typer.Typer:
-    """A typer application with the settings all commands share."""
+def create_app(help_text: str) -> typer.Typer:
+    """A typer application with the settings that all commands share."""
     return typer.Typer(
         help=help_text,
         add_completion=False,
@@ -46,7 +51,7 @@ def command_line(help_text: str) -> typer.Typer:
 
 
 def progress() -> Progress:
-    """A progress bar on standard error that leaves standard output clean."""
+    """A progress bar on standard error, so that standard output holds results only."""
     return Progress(
         TextColumn("{task.description}"),
         BarColumn(),

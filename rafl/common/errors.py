@@ -2,8 +2,8 @@
 
 
 class InputError(Exception):
-    """A mistake in the user's input. The message says what was expected, what was found and what to do."""
+    """An error in the user's input. The message says what was expected, what was found and what to do."""
 
 
 class SimulationError(Exception):
-    """A step or an equilibrium that the solver did not reach. The message names the trajectory, step and residual."""
+    """The solver did not converge for a step or an equilibrium. The message names the trajectory, step and residual."""

@@ -1,4 +1,4 @@
-"""Files written whole or not at all, and their hashes."""
+"""Atomic writing of files, checks of paths, and hashes."""
 
 import glob
 import hashlib
@@ -13,19 +13,19 @@ from rafl.common.errors import InputError
 
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside `path`; on success flush it to disk and rename it over `path`.
+def atomic_file(path: Path) -> Iterator[Path]:
+    """Yield a temporary path in the folder of `path`. On success, flush that file to disk and rename it to `path`.
 
-    On any failure the temporary file is removed and what stood at `path` is untouched. Temporary files of
-    programs that were killed are removed too.
+    If writing fails, the temporary file is removed and an earlier file at `path` stays as it was. Temporary files of
+    killed programs are removed too.
 
     Raises:
-        InputError: a folder stands at `path`.
+        InputError: `path` is a folder.
     """
     if path.is_dir():
         raise InputError(f"expected a file to write at {path}, found a folder; name a file in it")
     path.parent.mkdir(parents=True, exist_ok=True)
-    _remove_abandoned(path)
+    _remove_stale_files(path)
     prefix = f".{path.stem}-{platform.node()}-{os.getpid()}-"
     handle, name = tempfile.mkstemp(prefix=prefix, suffix=path.suffix, dir=path.parent)
     os.close(handle)
@@ -45,51 +45,55 @@ def whole_file(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _remove_abandoned(path: Path) -> None:
-    """Removes temporary files for `path` whose program, of this machine, is no longer there."""
-    own = f".{path.stem}-{platform.node()}-"
-    for temporary in path.parent.glob(f"{glob.escape(own)}*-*{glob.escape(path.suffix)}"):
-        pid = temporary.name.removeprefix(own).split("-")[0]
+def _remove_stale_files(path: Path) -> None:
+    """Remove temporary files for `path` of programs on this machine that no longer run."""
+    prefix = f".{path.stem}-{platform.node()}-"
+    for temporary in path.parent.glob(f"{glob.escape(prefix)}*-*{glob.escape(path.suffix)}"):
+        pid = temporary.name.removeprefix(prefix).split("-")[0]
         if not pid.isdecimal() or os.name == "nt":
             continue
         try:
             os.kill(int(pid), 0)
         except ProcessLookupError:
             temporary.unlink(missing_ok=True)
-        except OSError:  # there, and another user's
+        except OSError:  # the process runs, and belongs to another user
             continue
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write `text` to `path`, whole or not at all."""
-    with whole_file(path) as temporary:
+    """Write `text` to `path` atomically, as UTF-8."""
+    with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
-def require_file(path: Path, what: str) -> Path:
-    """Return `path` where it is a readable file; else say what was expected there."""
+def require_file(path: Path, label: str) -> Path:
+    """Return `path` if it is a file. `label` names the expected file in error messages.
+
+    Raises:
+        InputError: `path` does not exist, or is a folder.
+    """
     if not path.exists():
-        raise InputError(f"expected {what} at {path}, found nothing there; check the path")
+        raise InputError(f"expected {label} at {path}, found nothing there; check the path")
     if not path.is_file():
-        raise InputError(f"expected {what} at {path}, found a folder; name the file itself")
+        raise InputError(f"expected {label} at {path}, found a folder; name the file itself")
     return path
 
 
-def require_folder(path: Path, what: str) -> Path:
-    """Return `path` if it is a folder.
+def require_folder(path: Path, label: str) -> Path:
+    """Return `path` if it is a folder. `label` names the expected folder in error messages.
 
     Raises:
-        InputError: nothing, or a file, is there; the message says that `what` was expected.
+        InputError: `path` does not exist, or is a file.
     """
     if not path.exists():
-        raise InputError(f"expected {what} at {path}, found nothing there; check the path")
+        raise InputError(f"expected {label} at {path}, found nothing there; check the path")
     if not path.is_dir():
-        raise InputError(f"expected {what} at {path}, found a file; name the folder")
+        raise InputError(f"expected {label} at {path}, found a file; name the folder")
     return path
 
 
 def sha256(path: Path) -> str:
-    """SHA-256 of a file's content; of a folder's files one after another, by name."""
+    """SHA-256 of the content of a file, or of all files in a folder in the order of their names."""
     digest = hashlib.sha256()
     for part in sorted(path.iterdir()) if path.is_dir() else [path]:
         if part.is_file():

@@ -1,4 +1,4 @@
-"""One line that explains the wait while numba compiles kernels for the first time on a machine."""
+"""A message while numba compiles kernels for the first time on a computer."""
 
 import sys
 
@@ -7,7 +7,7 @@ from numba.core import event
 COMPILE_EVENT = "numba:compile"  # numba sends it for a real compilation, not for a kernel loaded from its cache
 
 
-class _Announcement(event.Listener):  # type: ignore[misc]  # numba has no types
+class _Announcement(event.Listener):
     """Prints one line when the first kernel is compiled."""
 
     def __init__(self) -> None:
@@ -24,5 +24,5 @@ class _Announcement(event.Listener):  # type: ignore[misc]  # numba has no types
 
 
 def announce_compilation() -> None:
-    """Print one line on standard error as soon as this process compiles a kernel that no earlier run kept."""
-    event.register(COMPILE_EVENT, _Announcement())
+    """Print one line on standard error as soon as this process compiles a kernel that is not in numba's cache."""
+    event.register(COMPILE_EVENT, _Announcement())  # type: ignore[no-untyped-call]  # numba has no types

@@ -1,3 +1,3 @@
-"""The version of the package, which every file that it writes carries."""
+"""Version of the package, stored in every file that it writes."""
 
 VERSION = "0.1.0"

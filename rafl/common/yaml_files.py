@@ -1,4 +1,4 @@
-"""YAML files that a person writes: read, validated and refused with a clear message."""
+"""Reading and validation of YAML files that a person writes."""
 
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,52 +13,64 @@ Model = TypeVar("Model", bound=pydantic.BaseModel)
 
 
 class StrictModel(pydantic.BaseModel):
-    """Base of every file a person writes: an unknown key is an error, not a silent no-op."""
+    """Base class for the content of YAML files. An unknown key is an error."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
 
 
-def read_yaml(path: Path, model: type[Model], what: str, version: str) -> Model:
-    """Read and validate a YAML file a person wrote, of format `version` (`name/number`).
+def read_yaml(path: Path, model: type[Model], label: str, version: str) -> Model:
+    """Read and validate a YAML file.
+
+    Args:
+        path: of the file.
+        model: class that the content is validated against.
+        label: name of the file's kind in error messages.
+        version: expected format, `name/number`.
 
     Raises:
-        InputError: no such file, not YAML, of another format or a newer version, an unknown or missing
-            key, a value of another kind.
+        InputError: the file does not exist, is not YAML, has another format or a newer version, has an unknown or
+            missing key, or has a value of the wrong type.
     """
-    content = yaml_content(path, what, version)
+    content = read_yaml_content(path, label, version)
     try:
         return model.model_validate(content)
     except pydantic.ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"]) or "the file"
         found = "" if first["type"] == "missing" else f", found {first['input']!r:.80}"
-        more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
+        others = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         message = first["msg"].removeprefix("Value error, ")
-        raise InputError(f"{what} {path}: {key}: {message}{found}; correct that key{more}") from None
+        raise InputError(f"{label} {path}: {key}: {message}{found}; correct that key{others}") from None
 
 
-def yaml_content(path: Path, what: str, version: str) -> dict[str, Any]:
-    """The keys and values of a YAML file of format `version` (`name/number`), `format` among them.
+def read_yaml_content(path: Path, label: str, version: str) -> dict[str, Any]:
+    """Read a YAML file without validation: all its keys and values, including `format`.
+
+    Args:
+        path: of the file.
+        label: name of the file's kind in error messages.
+        version: expected format, `name/number`.
 
     Raises:
-        InputError: no such file, not YAML, of another format or a newer version.
+        InputError: the file does not exist, is not YAML, has another format or a newer version.
     """
-    require_file(path, what)
+    require_file(path, label)
     try:
         content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:  # the last of brackets hundreds deep
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:  # RecursionError: hundreds of nested brackets
         reason = " ".join(str(error).split())
-        raise InputError(f"expected {what} in {path}, which is not readable as YAML: {reason}") from None
+        raise InputError(f"expected {label} in {path}, which is not readable as YAML: {reason}") from None
     if not isinstance(content, dict):
-        raise InputError(f"expected {what} in {path}, found no keys and values; is it the right file?")
+        raise InputError(f"expected {label} in {path}, found no keys and values; is it the right file?")
     check_format(str(content.get("format", "no `format:`")), version, path)
     return content
 
 
 def check_format(found: str, expected: str, path: Path) -> None:
-    """Refuse a file of another kind, or of a newer version, by name.
+    """Check the format of a file. Formats are written `name/number`, for instance `rafl-calibration/1`.
 
-    `expected` is `name/version`, for instance `rafl-calibration/1`.
+    Raises:
+        InputError: the file has another format, or a newer version of it.
     """
     name, _, version = expected.partition("/")
     found_name, _, found_version = found.partition("/")

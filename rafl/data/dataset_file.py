@@ -1,4 +1,4 @@
-"""The dataset file (see datasets/README.md): written whole, checked on the way in and out, with hashes."""
+"""The dataset file (see datasets/README.md): written atomically, checked when written and read, with hashes."""
 
 import datetime
 import hashlib
@@ -11,21 +11,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.common.errors import InputError
-from rafl.common.files import require_file, whole_file
+from rafl.common.files import require_file, atomic_file
 from rafl.common.version import VERSION
 from rafl.common.yaml_files import check_format
-from rafl.data.dataset import UNEVEN, Dataset, Trajectory
+from rafl.data.dataset import MAX_RELATIVE_TIME_ERROR, Dataset, Trajectory
 from rafl.data.markers import Markers
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.simulator import Simulator
 
+Array = NDArray[Any]
+
 FORMAT = "rafl-dataset/1"
 UNITS = "SI: m, s, kg, N, Pa; specimen frame: origin at a corner of the clamped face, x to the tip, z up"
-SPECIMEN = ("mesh", "material", "markers")  # groups that all recordings share
-HASH = "sha256"
-# Unit and frame of every array, by its name.
-MEANING = {
+SPECIMEN_GROUPS = ("mesh", "material", "markers")  # groups that all recordings share
+HASH_ATTRIBUTE = "sha256"
+# Unit and frame of every array, by its name. The hashes cover these texts: changing one breaks updates of older files.
+UNITS_AND_FRAMES = {
     "vertices": ("m", "specimen, at rest"),
     "hexes": ("1", "vertices of each cell"),
     "fixed": ("1", "held vertices"),
@@ -45,46 +47,47 @@ MEANING = {
 }
 
 
-def write_dataset(path: Path, dataset: Dataset) -> None:
-    """Write a dataset file, whole or not at all.
+def write_dataset(path: str | Path, dataset: Dataset) -> None:
+    """Write a dataset file atomically.
 
     Raises:
-        ValueError: parts that do not fit together.
+        ValueError: parts of the dataset are inconsistent.
     """
+    path = Path(path)
     dataset.check()
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+    with atomic_file(path) as temporary, h5py.File(temporary, "w") as file:
         _write(file, dataset, dataset.recipe)
 
 
 def update_dataset(path: Path, dataset: Dataset) -> None:
-    """Add a dataset's recordings to a file, in the place of those of the same name; the others stay as they are.
+    """Add a dataset's recordings to a file. They replace recordings of the same name; the others do not change.
 
     Raises:
-        InputError: no dataset there, or one of another specimen.
-        ValueError: parts that do not fit together.
+        InputError: the file is no dataset, or one of another specimen, frame rate or time integration.
+        ValueError: parts of the dataset are inconsistent.
     """
     earlier = read_dataset(path)
     own, other = earlier.simulator, dataset.simulator
-    if abs(other.time_step / own.time_step - 1.0) > UNEVEN:
+    if abs(other.time_step / own.time_step - 1.0) > MAX_RELATIVE_TIME_ERROR:
         raise InputError(
             f"expected recordings of {1 / own.time_step:.2f} frames/s as in {path}, found {1 / other.time_step:.2f}; "
-            "put them into another dataset"
+            "write them to another dataset"
         )
     for key in ("gravity", "integrator", "substeps"):
         if getattr(own, key) != getattr(other, key):
             raise InputError(
-                f"expected {key} {getattr(own, key)} as in {path}, found {getattr(other, key)}; build it whole, "
-                "without --update"
+                f"expected {key} {getattr(own, key)} as in {path}, found {getattr(other, key)}; build the whole "
+                "dataset again, without --update"
             )
     dataset = replace(dataset, simulator=replace(other, time_step=own.time_step))
     dataset.check()
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file, h5py.File(path, "r") as old:
+    with atomic_file(path) as temporary, h5py.File(temporary, "w") as file, h5py.File(path, "r") as old:
         _write(file, dataset, f"{earlier.recipe}\n# then\n{dataset.recipe}")
-        for part in SPECIMEN:
-            if file[part].attrs[HASH] != _digest(old[part]):
+        for part in SPECIMEN_GROUPS:
+            if file[part].attrs[HASH_ATTRIBUTE] != _digest(old[part]):
                 raise InputError(
-                    f"expected a dataset of the same specimen in {path}, found another {part}; build it whole, "
-                    "without --update"
+                    f"expected a dataset of the same specimen in {path}, found another {part}; build the whole "
+                    "dataset again, without --update"
                 )
         for name in earlier.trajectories:
             if name not in dataset.trajectories:
@@ -107,32 +110,34 @@ def _write(file: h5py.File, dataset: Dataset, recipe: str) -> None:
             "substeps": simulator.substeps,
         }
     )
-    _put(file, "mesh/vertices", simulator.mesh.vertices)
-    _put(file, "mesh/hexes", simulator.mesh.hexes)
-    _put(file, "mesh/fixed", simulator.fixed)
+    _write_array(file, "mesh/vertices", simulator.mesh.vertices)
+    _write_array(file, "mesh/hexes", simulator.mesh.hexes)
+    _write_array(file, "mesh/fixed", simulator.fixed)
     file.create_group("material").attrs.update(vars(simulator.material))
     for key in ("rest", "quad", "weights", "normal_offset"):
-        _put(file, f"markers/{key}", getattr(markers, key))
+        _write_array(file, f"markers/{key}", getattr(markers, key))
     file["markers/names"] = np.array(markers.names, dtype=h5py.string_dtype())
     file.create_group("trajectories")
     for name, item in dataset.trajectories.items():
         for key in ("time", "markers", "valid", "sigma", "load", "added_mass"):
-            _put(file, f"trajectories/{name}/{key}", getattr(item, key))
+            _write_array(file, f"trajectories/{name}/{key}", getattr(item, key))
         for key in ("q", "v", "virtual_force"):
-            _put(file, f"trajectories/{name}/initial/{key}", getattr(item, key))
+            _write_array(file, f"trajectories/{name}/initial/{key}", getattr(item, key))
         file[f"trajectories/{name}"].attrs.update({"split": item.split, **item.attributes})
-    for group in (*(file[part] for part in SPECIMEN), *file["trajectories"].values()):
-        group.attrs[HASH] = _digest(group)
-    file.attrs[HASH] = _digest(file, deep=False)
+    for group in (*(file[part] for part in SPECIMEN_GROUPS), *file["trajectories"].values()):
+        group.attrs[HASH_ATTRIBUTE] = _digest(group)
+    file.attrs[HASH_ATTRIBUTE] = _digest(file, deep=False)
 
 
-def _put(file: h5py.File, key: str, value: NDArray) -> None:
-    made = file.create_dataset(key, data=value, fletcher32=value.size > 0, chunks=value.shape if value.size else None)
-    made.attrs["unit"], made.attrs["frame"] = MEANING[key.rpartition("/")[2]]
+def _write_array(file: h5py.File, key: str, value: Array) -> None:
+    written = file.create_dataset(
+        key, data=value, fletcher32=value.size > 0, chunks=value.shape if value.size else None
+    )
+    written.attrs["unit"], written.attrs["frame"] = UNITS_AND_FRAMES[key.rpartition("/")[2]]
 
 
 def _digest(group: h5py.Group, deep: bool = True) -> str:
-    """SHA-256 of a group's attributes and, where `deep`, of all arrays in it."""
+    """SHA-256 of a group's attributes and, if `deep`, of everything in it."""
     digest = hashlib.sha256()
 
     def add(name: str, value: Any) -> None:
@@ -144,7 +149,7 @@ def _digest(group: h5py.Group, deep: bool = True) -> str:
         if isinstance(item, h5py.Dataset):
             add(name, item.asstr()[()] if item.dtype.kind == "O" else item[()])
         for key in sorted(item.attrs):
-            if key != HASH:
+            if key != HASH_ATTRIBUTE:
                 add(f"{name}.{key}", item.attrs[key])
 
     visit("", group)
@@ -154,43 +159,44 @@ def _digest(group: h5py.Group, deep: bool = True) -> str:
 
 
 def damaged_parts(path: Path) -> list[str]:
-    """Parts of a dataset file whose content is not what its hash says, or cannot be read.
+    """Names of the groups of a dataset file that cannot be read or whose content does not match their hash.
 
     Raises:
         InputError: no dataset file, or one without hashes.
     """
     require_file(path, "a dataset (.h5)")
-    found = []
+    damaged = []
     try:
         with h5py.File(path, "r") as file:
             check_format(str(file.attrs.get("format", "")), FORMAT, path)
-            for name in ("/", *SPECIMEN, *(f"trajectories/{name}" for name in file["trajectories"])):
-                if HASH not in file[name].attrs:
+            for name in ("/", *SPECIMEN_GROUPS, *(f"trajectories/{name}" for name in file["trajectories"])):
+                if HASH_ATTRIBUTE not in file[name].attrs:
                     raise InputError(f"expected hashes in {path}, found none for {name}; build it again")
                 try:
-                    whole = file[name].attrs[HASH] == _digest(file[name], deep=name != "/")
-                except OSError:  # a checksum of HDF5 itself
-                    whole = False
-                if not whole:
-                    found.append(name)
+                    intact = file[name].attrs[HASH_ATTRIBUTE] == _digest(file[name], deep=name != "/")
+                except OSError:  # HDF5 verifies a checksum of its own
+                    intact = False
+                if not intact:
+                    damaged.append(name)
     except (OSError, KeyError, RuntimeError) as error:
-        raise _unreadable(path, error) from None
-    return found
+        raise _unreadable_error(path, error) from None
+    return damaged
 
 
-def _unreadable(path: Path, error: Exception) -> InputError:
+def _unreadable_error(path: Path, error: Exception) -> InputError:
     reason = " ".join(str(error).split())
     return InputError(
         f"expected a dataset written by rafl-capture in {path}, which cannot be read: {reason}; build it again"
     )
 
 
-def read_dataset(path: Path) -> Dataset:
+def read_dataset(path: str | Path) -> Dataset:
     """Read and check a dataset file.
 
     Raises:
-        InputError: no such file, not a dataset, a newer version, or a part missing, damaged or unfit.
+        InputError: no such file, not a dataset, a newer version, or a missing, damaged or inconsistent part.
     """
+    path = Path(path)
     require_file(path, "a dataset (.h5)")
     try:
         with h5py.File(path, "r") as file:
@@ -198,7 +204,7 @@ def read_dataset(path: Path) -> Dataset:
             dataset = _read(file)
         dataset.check()
     except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise _unreadable(path, error) from None
+        raise _unreadable_error(path, error) from None
     if not dataset.trajectories:
         raise InputError(f"expected at least one trajectory in {path}, found none; run rafl-capture again")
     return dataset
@@ -206,10 +212,9 @@ def read_dataset(path: Path) -> Dataset:
 
 def _read(file: h5py.File) -> Dataset:
     gx, gy, gz = (float(g) for g in file.attrs["gravity"])
-    material = {key: _plain(value) for key, value in file["material"].attrs.items() if key != HASH}
     simulator = Simulator(
         HexMesh(file["mesh/vertices"][()], file["mesh/hexes"][()]),
-        Material(**material),
+        Material(**_attributes(file["material"])),
         file["mesh/fixed"][()],
         float(file.attrs["time_step"]),
         (gx, gy, gz),
@@ -224,12 +229,14 @@ def _read(file: h5py.File) -> Dataset:
             **{key: group[key][()] for key in ("time", "markers", "valid", "sigma", "load", "added_mass")},
             **{key: group["initial"][key][()] for key in ("q", "v", "virtual_force")},
             split=str(group.attrs["split"]),
-            attributes={key: _plain(value) for key, value in group.attrs.items() if key not in ("split", HASH)},
+            attributes={key: value for key, value in _attributes(group).items() if key != "split"},
         )
         for name, group in file.get("trajectories", {}).items()
     }
     return Dataset(str(file.attrs["name"]), simulator, markers, trajectories, str(file.attrs["recipe"]))
 
 
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else value
+def _attributes(group: h5py.Group) -> dict[str, Any]:
+    """A group's attributes but its hash, as Python values."""
+    found = {key: value for key, value in group.attrs.items() if key != HASH_ATTRIBUTE}
+    return {key: value.item() if isinstance(value, np.generic) else value for key, value in found.items()}

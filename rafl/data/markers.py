@@ -1,4 +1,4 @@
-"""Markers on the skin: each rides on one boundary quad of the mesh (paper, observation operator x(s))."""
+"""Surface markers: each is embedded in one boundary quad of the mesh (paper, observation operator x(s))."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,13 +15,13 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Markers:
-    """Markers tied to a mesh.
+    """Markers embedded in a mesh.
 
     Attributes:
         names: (M).
         rest: layout positions in the specimen frame [m], (M, 3).
-        quad: the boundary quad each rides on, vertices anticlockwise from outside, (M, 4).
-        weights: bilinear weights of the quad's vertices, adding up to 1, (M, 4).
+        quad: vertices of each marker's boundary quad, anticlockwise seen from outside, (M, 4).
+        weights: bilinear weights of the quad's vertices; they add up to 1, (M, 4).
         normal_offset: signed distance along the quad's outward normal [m], (M,).
     """
 
@@ -31,8 +31,8 @@ class Markers:
     weights: Array
     normal_offset: Array
 
-    def some(self, chosen: NDArray[np.int64]) -> "Markers":
-        """Those of some rows."""
+    def select(self, chosen: NDArray[np.int64]) -> "Markers":
+        """The markers of the given rows."""
         names = tuple(self.names[k] for k in chosen)
         return Markers(names, self.rest[chosen], self.quad[chosen], self.weights[chosen], self.normal_offset[chosen])
 
@@ -40,8 +40,8 @@ class Markers:
         """Marker positions [m], (..., M, 3), at mesh positions q (..., N, 3); differentiable."""
         return self._from_corners(q[..., torch.from_numpy(self.quad), :])
 
-    def slopes(self, q: Tensor) -> Tensor:
-        """Derivatives of the markers' positions by their quads' corners, (..., M, 3, 4, 3)."""
+    def corner_jacobian(self, q: Tensor) -> Tensor:
+        """Derivatives of marker positions with respect to their quads' corners, (..., M, 3, 4, 3)."""
         with torch.enable_grad():
             corners = q[..., torch.from_numpy(self.quad), :].detach().requires_grad_()
             position = self._from_corners(corners)
@@ -54,31 +54,29 @@ class Markers:
         point = (corners * torch.from_numpy(self.weights)[:, :, None]).sum(-2)
         normal = torch.linalg.cross((corners * along[:, :, None]).sum(-2), (corners * across[:, :, None]).sum(-2))
         normal = normal / torch.linalg.norm(normal, dim=-1, keepdim=True)
-        return point + torch.from_numpy(self.normal_offset)[:, None] * normal
+        result: Tensor = point + torch.from_numpy(self.normal_offset)[:, None] * normal
+        return result
 
     @property
     def _tangent_weights(self) -> Array:
-        """Weights of the quads' vertices in the two tangents at the markers, (2, M, 4)."""
+        """Weights of the quads' vertices in the two tangent vectors at the markers, (2, M, 4)."""
         s = self.weights[:, 1] + self.weights[:, 2]
         t = self.weights[:, 2] + self.weights[:, 3]
-        return np.stack(
-            [
-                np.stack([t - 1.0, 1.0 - t, t, -t], axis=1),
-                np.stack([s - 1.0, -s, s, 1.0 - s], axis=1),
-            ]
-        )
+        along = np.stack([t - 1.0, 1.0 - t, t, -t], axis=1)
+        across = np.stack([s - 1.0, -s, s, 1.0 - s], axis=1)
+        return np.stack([along, across])
 
 
 def embed(mesh: HexMesh, names: tuple[str, ...], points: Array) -> Markers:
-    """Tie points to the boundary quads nearest to them.
+    """Embed points in their nearest boundary quads.
 
-    Bilinear weights of the foot point, held inside the quad, plus the signed distance from it along
-    the normal; what is left across (a marker beyond an edge) is reported by `embedding_gap`.
+    A marker stores the bilinear weights of its foot point, clamped to the quad, and its signed distance from there
+    along the normal. A marker beyond an edge is also offset sideways; `embedding_gap` returns that remainder.
 
     Args:
         mesh: the specimen at rest.
         names: of the points, (M).
-        points: specimen frame [m], (M, 3).
+        points: positions in the specimen frame [m], (M, 3).
     """
     corners = mesh.vertices[mesh.surface]  # (S, 4, 3)
     quads, weights, offsets = [], [], []
@@ -91,11 +89,8 @@ def embed(mesh: HexMesh, names: tuple[str, ...], points: Array) -> Markers:
             gap = point - w @ corners[index]
             normal = _normal(corners[index], s, t)
             offset = float(gap @ normal)
-            # Off a corner several quads are equally far: the one it stands over, then the sharpest.
-            key = (
-                round(float(np.linalg.norm(gap)), 9),
-                round(float(np.linalg.norm(gap - offset * normal)), 9),
-            )
+            # Several quads are equally near to a point off a corner: take the one with the least sideways offset.
+            key = (round(float(np.linalg.norm(gap)), 9), round(float(np.linalg.norm(gap - offset * normal)), 9))
             if nearest is None or key < nearest[0]:
                 nearest = (key, index, w, offset)
         assert nearest is not None
@@ -106,9 +101,9 @@ def embed(mesh: HexMesh, names: tuple[str, ...], points: Array) -> Markers:
 
 
 def embedding_gap(mesh: HexMesh, markers: Markers) -> Array:
-    """How far the embedded markers stand from their layout positions at rest [m], (M,)."""
+    """Distances between the embedded markers and their layout positions at rest [m], (M,)."""
     embedded = markers.positions(torch.from_numpy(mesh.vertices)).numpy()
-    return np.linalg.norm(embedded - markers.rest, axis=1)
+    return np.asarray(np.linalg.norm(embedded - markers.rest, axis=1))
 
 
 def _longest_edge(corners: Array) -> float:
@@ -120,18 +115,18 @@ def _normal(corners: Array, s: float, t: float) -> Array:
     along = (1 - t) * (b - a) + t * (c - d)
     across = (1 - s) * (d - a) + s * (c - b)
     normal = np.cross(along, across)
-    return normal / np.linalg.norm(normal)
+    return np.asarray(normal / np.linalg.norm(normal))
 
 
 def _foot_point(corners: Array, point: Array) -> tuple[float, float]:
-    """Bilinear coordinates (s, t) in [0, 1]^2 of the quad's point nearest to `point` (Gauss-Newton)."""
+    """Bilinear coordinates (s, t) in [0, 1]^2 of the point of a quad nearest to `point` (Gauss-Newton)."""
     a, b, c, d = corners
     st = np.array([0.5, 0.5])
     for _ in range(50):
         s, t = st
-        here = (1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d
+        current = (1 - s) * (1 - t) * a + s * (1 - t) * b + s * t * c + (1 - s) * t * d
         tangents = np.stack([(1 - t) * (b - a) + t * (c - d), (1 - s) * (d - a) + s * (c - b)], axis=1)
-        step = np.linalg.lstsq(tangents, point - here, rcond=None)[0]
+        step = np.linalg.lstsq(tangents, point - current, rcond=None)[0]
         new = np.clip(st + step, 0.0, 1.0)
         if np.abs(new - st).max() < 1e-14:
             break

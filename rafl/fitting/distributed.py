@@ -1,4 +1,4 @@
-"""Several training processes as one: recordings shared out, gradients added up (torch.distributed, gloo)."""
+"""Training in several processes: recordings are shared out and gradients summed (torch.distributed, gloo)."""
 
 import os
 from collections.abc import Iterator, Sequence
@@ -13,37 +13,38 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Processes:
-    """Which of how many processes this one is.
+class ProcessGroup:
+    """The training processes, seen from one of them.
 
     Attributes:
-        rank: from 0; process 0 writes the files.
-        count: of all.
+        rank: number of this process, from 0.
+        count: number of processes.
     """
 
     rank: int = 0
     count: int = 1
 
     @property
-    def first(self) -> bool:
-        """Whether this process writes and reports."""
+    def is_main(self) -> bool:
+        """Whether this is process 0, which writes files and reports."""
         return self.rank == 0
 
-    def mine(self, items: Sequence[T]) -> list[T]:
+    def share(self, items: Sequence[T]) -> list[T]:
         """This process's share of some items."""
         return list(items[self.rank :: self.count])
 
-    def add_up(self, tensors: Sequence[torch.Tensor]) -> None:
-        """Replace tensors by their sum over all processes."""
+    def sum_over_processes(self, tensors: Sequence[torch.Tensor]) -> None:
+        """Replace tensors, in place, by their sums over all processes."""
         if self.count == 1:
             return
         flat = torch.cat([tensor.reshape(-1) for tensor in tensors])
         dist.all_reduce(flat)
-        for tensor, part in zip(tensors, flat.split([tensor.numel() for tensor in tensors]), strict=True):
+        parts = torch.split(flat, [tensor.numel() for tensor in tensors])
+        for tensor, part in zip(tensors, parts, strict=True):
             tensor.copy_(part.reshape(tensor.shape))
 
-    def agree(self, value: float) -> float:
-        """Process 0's number, in all processes."""
+    def broadcast(self, value: float) -> float:
+        """Process 0's value, in all processes."""
         if self.count == 1:
             return value
         shared = torch.tensor([value], dtype=torch.float64)
@@ -51,30 +52,30 @@ class Processes:
         return float(shared)
 
     def wait(self) -> None:
-        """Until all are here."""
+        """Wait until all processes have reached this call."""
         if self.count > 1:
             dist.barrier()
 
 
 def rank() -> int:
-    """This process's number among those that torchrun started; 0 where it started none."""
+    """This process's number among those that torchrun started; 0 without torchrun."""
     return int(os.environ.get("RANK", "0"))
 
 
 def process_count() -> int:
-    """How many processes torchrun started; 1 where it started none."""
+    """Number of processes that torchrun started; 1 without torchrun."""
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 @contextmanager
-def processes() -> Iterator[Processes]:
-    """Those that torchrun started, or this one alone."""
+def process_group() -> Iterator[ProcessGroup]:
+    """The processes that torchrun started, or this one alone."""
     count = process_count()
     if count == 1:
-        yield Processes()
+        yield ProcessGroup()
         return
     dist.init_process_group("gloo")
     try:
-        yield Processes(rank(), count)
+        yield ProcessGroup(rank(), count)
     finally:
         dist.destroy_process_group()

@@ -8,10 +8,10 @@ from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.fitting.distributed import process_count, rank
-from rafl.fitting.methods import EPOCHS, METHODS, check_inputs
+from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs
 from rafl.fitting.run_folder import FittedModel, Settings, read_settings, write_settings
-from rafl.fitting.train_field import Report, nothing_to_follow
-from rafl.fitting.warm_start import LARGEST
+from rafl.fitting.train_field import Report, pretraining_unavailable
+from rafl.fitting.warm_start import MAX_VERTICES
 
 
 def fit(
@@ -42,9 +42,9 @@ def fit(
         run: folder for model.pt, history.csv, config.yaml and the checkpoint; must not hold a run yet.
         method: `rafl` (residual acceleration field), `srl` (supervised baseline), `sysid` (E and nu), `sysid-e` (E at
             nu = 0.499) or `sysid-damping` (E, nu and viscosity).
-        resume: continue the interrupted run in the folder, with the same settings.
+        resume: continue the interrupted run in the folder; the settings must be the same.
         report: called with every row of the history.
-        notify: called with every remark on the settings.
+        notify: called with a message for every setting that has no effect.
         epochs: maximum number of passes over the recordings; by method if None.
         learning_rate: initial learning rate of Adam.
         weight_decay: of Adam.
@@ -66,7 +66,7 @@ def fit(
     settings = Settings(
         method=method,
         datasets=tuple(str(Path(path).resolve()) for path in datasets),
-        epochs=epochs or EPOCHS.get(method, 1),
+        epochs=epochs or DEFAULT_EPOCHS.get(method, 1),
         learning_rate=learning_rate,
         weight_decay=weight_decay,
         patience=patience,
@@ -82,23 +82,23 @@ def fit(
     check_inputs(method, loaded, Path(start) if start else None, integrator)
     if rank() == 0:  # of the processes that torchrun started
         open_run(Path(run), settings, resume)
-        _remark(loaded, settings, notify)
+        _notify_unused_settings(loaded, settings, notify)
     return METHODS[method](loaded, settings, Path(run), report or (lambda row: None))
 
 
-def _remark(datasets: list[Dataset], settings: Settings, notify: Callable[[str], None]) -> None:
-    """Say what the settings leave unused."""
+def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify: Callable[[str], None]) -> None:
+    """Report processes that get no recording, and pre-training that no dataset allows."""
     if process_count() > settings.batch:
-        notify(f"{process_count()} processes share a batch of {settings.batch}: raise the batch to use them all")
-    if settings.method == "rafl" and nothing_to_follow(datasets, settings):
-        notify(f"no pre-training: it needs implicit-euler, one substep, no viscosity and at most {LARGEST} vertices")
+        notify(f"{process_count()} processes share a batch of {settings.batch}: raise --batch to use them all")
+    if settings.method == "rafl" and pretraining_unavailable(datasets, settings):
+        notify(f"no pre-training: it needs implicit-euler, 1 substep, no viscosity and at most {MAX_VERTICES} vertices")
 
 
 def open_run(run: Path, settings: Settings, resume: bool) -> None:
-    """Create a run folder, or reopen it to resume. Two runs never share a folder.
+    """Create a run folder, or reopen one to resume its run. Two runs never share a folder.
 
     Raises:
-        InputError: the folder holds a run already, or, to resume, a run with other settings.
+        InputError: the folder already holds a run or, when resuming, a run with other settings.
     """
     if resume:
         earlier = read_settings(run)

@@ -1,4 +1,4 @@
-"""The methods that fit a model, all called alike."""
+"""The methods that fit a model, behind one interface."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -6,33 +6,34 @@ from pathlib import Path
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.fitting.run_folder import FittedModel, Settings
-from rafl.fitting.supervised import fit_supervised, one_mesh
-from rafl.fitting.sysid import SOUGHT, identify_material
-from rafl.fitting.train_field import Report, fit_residual_field, model_to_go_on_from, training_items
+from rafl.fitting.supervised import fit_supervised, shared_vertex_count
+from rafl.fitting.sysid import METHOD_QUANTITIES, identify_material
+from rafl.fitting.train_field import Report, fit_residual_field, load_start_model, training_items
 from rafl.simulation.time_integration import INTEGRATORS
 
-Trainer = Callable[[list[Dataset], Settings, Path, Report], FittedModel]
+FitFunction = Callable[[list[Dataset], Settings, Path, Report], FittedModel]
 
-METHODS: dict[str, Trainer] = {
+METHODS: dict[str, FitFunction] = {
     "rafl": fit_residual_field,
     "srl": fit_supervised,
-    **dict.fromkeys(SOUGHT, identify_material),
+    **dict.fromkeys(METHOD_QUANTITIES, identify_material),
 }
-EPOCHS = {"rafl": 30, "srl": 1000, **dict.fromkeys(SOUGHT, 40)}  # at most, where the user does not say
+# Default maximum number of passes over the recordings (iterations of sysid).
+DEFAULT_EPOCHS = {"rafl": 30, "srl": 1000, **dict.fromkeys(METHOD_QUANTITIES, 40)}
 
 
 def check_inputs(method: str, datasets: list[Dataset], start: Path | None, integrator: str) -> None:
-    """Refuses what a method cannot be fitted to, before anything is written.
+    """Check that a method can be fitted to datasets, before anything is written.
 
     Args:
-        method: to be.
+        method: one of `METHODS`.
         datasets: to train on.
-        start: run to go on from.
-        integrator: to train with; the run's or the datasets' own where empty.
+        start: run that training starts from.
+        integrator: to train with; empty for that of the start run or else of the datasets.
 
     Raises:
-        InputError: an unknown method or integrator, datasets that step differently, no training recordings, several
-            meshes for srl, nothing to go on from.
+        InputError: an unknown method or integrator, datasets that differ in time integration, no training recordings,
+            several meshes for srl, or a run that training cannot start from.
     """
     if method not in METHODS:
         raise InputError(f"--method: expected {', '.join(METHODS)}, found {method!r}")
@@ -40,22 +41,26 @@ def check_inputs(method: str, datasets: list[Dataset], start: Path | None, integ
         raise InputError(f"--integrator: expected {' or '.join(INTEGRATORS)}, found {integrator!r}")
     if start is not None and method != "rafl":
         raise InputError(f"--from: expected method rafl, found {method}; leave it out")
-    before = FittedModel(method) if start is None else model_to_go_on_from(start)
-    _one_stepping(datasets, before, integrator)
+    before = FittedModel(method) if start is None else load_start_model(start)
+    _check_time_integration(datasets, before, integrator)
     training_items(datasets)
     if method == "srl":
-        one_mesh(datasets)
+        shared_vertex_count(datasets)
 
 
-def _one_stepping(datasets: list[Dataset], before: FittedModel, integrator: str) -> None:
-    """Refuses datasets whose simulators would step differently: a model is of one way to step."""
-    ways = {}
+def _check_time_integration(datasets: list[Dataset], before: FittedModel, integrator: str) -> None:
+    """Check that all simulators integrate time alike, because a model belongs to one time integration.
+
+    Raises:
+        InputError: they differ in integrator or substeps.
+    """
+    integrations = {}
     for dataset in datasets:
         simulator = dataset.simulator if integrator else before.simulator(dataset.simulator)
-        ways[dataset.name] = (integrator or simulator.integrator, simulator.substeps)
-    if len(set(ways.values())) > 1:
-        found = ", ".join(f"{name}: {way}, {substeps} substeps" for name, (way, substeps) in ways.items())
+        integrations[dataset.name] = (integrator or simulator.integrator, simulator.substeps)
+    if len(set(integrations.values())) > 1:
+        found = ", ".join(f"{name}: {scheme}, {substeps} substeps" for name, (scheme, substeps) in integrations.items())
         raise InputError(
-            f"expected datasets whose simulators step alike, found {found}; set `simulation` in the specimen files and "
-            "run rafl-capture again"
+            f"expected datasets with the same time integration, found {found}; set `simulation` in the specimen files "
+            "and run rafl-capture again"
         )

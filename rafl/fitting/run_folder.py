@@ -1,4 +1,4 @@
-"""A run folder: the fitted model, its settings, its history and where to resume."""
+"""The run folder: the fitted model, its settings, its history and the checkpoint to resume from."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -12,8 +12,8 @@ import torch
 import yaml
 
 from rafl.common.errors import InputError
-from rafl.common.files import require_file, whole_file, write_text
-from rafl.common.yaml_files import check_format, yaml_content
+from rafl.common.files import require_file, atomic_file, write_text
+from rafl.common.yaml_files import check_format, read_yaml_content
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.global_residual import GlobalResidual
 from rafl.simulation.parameters import Parameters
@@ -22,64 +22,67 @@ from rafl.simulation.simulator import Simulator
 from rafl.simulation.time_integration import INTEGRATORS
 
 FORMAT = "rafl-run/1"
+TIME_INTEGRATION_KEY = "stepping"  # in model.pt
 
 
 @dataclass(frozen=True)
 class FittedModel:
-    """What a fit leaves: a residual field, identified material parameters, or both, and how time was stepped with them.
+    """The result of a fit: a residual field, identified material parameters, or both, and their time integration.
 
     Attributes:
-        method: one of `rafl.fitting.methods.METHODS`.
+        method: one of `rafl.fitting.methods.METHODS`, or `original` for the baseline simulator.
         field: the residual acceleration field, for `rafl`.
-        material: identified values by their name in `rafl.simulation.parameters.Parameters`, for `sysid` and its kin, and for a
-            field that was trained on top of such.
+        material: identified values by their name in `rafl.simulation.parameters.Parameters`, for the `sysid` methods
+            and for a field that was trained on top of an identified material.
         network: from the whole state to nodal forces, for `srl`.
-        stepping: `integrator` and `substeps` of the simulator that it was fitted in; a specimen's own where None.
+        time_integration: `integrator` and `substeps` of the simulator that the model was fitted in; None for the
+            specimen's own.
     """
 
     method: str
     field: ResidualField | None = None
     material: dict[str, float] | None = None
     network: GlobalResidual | None = None
-    stepping: dict[str, Any] | None = None
+    time_integration: dict[str, Any] | None = None
 
     def simulator(self, own: Simulator) -> Simulator:
-        """A specimen's simulator, stepping as the one that this was fitted in."""
-        return own if self.stepping in (None, own.stepping) else replace(own, **self.stepping)
+        """A specimen's simulator with the time integration that this model was fitted with."""
+        return own if self.time_integration in (None, own.time_integration) else replace(own, **self.time_integration)
 
     def residual(self, simulator: Simulator) -> ResidualForce | None:
-        """The residual force on a specimen, if this model has one.
+        """The residual force on a specimen, or None if this model has none.
 
         Raises:
-            InputError: a mesh that the model cannot act on.
+            InputError: the model is not applicable to this mesh.
         """
         residual = self.field or self.network
         return residual.on(simulator) if residual is not None else None
 
     def parameters(self, simulator: Simulator) -> Parameters:
-        """What to simulate a specimen with: its own material, or the identified one."""
+        """Parameters to simulate a specimen with: the identified material, or else its own."""
         return simulator.parameters(**(self.material or {}))
 
 
 @dataclass(frozen=True)
 class Settings:
-    """How a model was fitted; `config.yaml` in the run folder.
+    """The settings of a fit, written to `config.yaml` in the run folder.
 
     Attributes:
-        method: `rafl` or `sysid`.
+        method: one of `rafl.fitting.methods.METHODS`.
         datasets: absolute paths of the dataset files.
-        epochs: passes over the training recordings, at most.
-        learning_rate: Adam's, at the start of the cosine decay.
-        weight_decay: Adam's.
+        epochs: maximum number of passes over the training recordings.
+        learning_rate: initial learning rate of Adam; it decays as a cosine.
+        weight_decay: of Adam.
         patience: epochs without a better validation error before training stops.
-        frames: leading frames of each recording that training simulates (all when 0); a warm start follows all.
+        frames: number of leading frames of each recording that training simulates, 0 for all; pre-training uses all.
         seed: of the initial weights and the order of recordings.
-        batch: recordings an update.
+        batch: recordings per update.
         force_penalty: the paper's lambda_1 [m^2/N^2].
-        warm_start: passes over the forces that follow the recordings step by step, before the first simulation.
-        start: run folder whose field or material training goes on from; empty for new weights and the datasets' own.
-        by_sigma: whether markers count by their uncertainty.
-        integrator: by which the simulator steps; empty for that of `start` or else of the datasets.
+        warm_start: passes of pre-training on residual targets, before the first simulation.
+        start: run folder whose field or material training starts from; empty for new weights and the datasets' own
+            material.
+        by_sigma: whether to weight markers by their uncertainty.
+        integrator: time integration of the simulator; empty for that of `start` or else of the datasets.
     """
 
     method: str
@@ -108,10 +111,10 @@ def read_settings(run: Path) -> Settings:
     """Read `config.yaml`.
 
     Raises:
-        InputError: not a run folder, or a newer one.
+        InputError: not a run folder, or one of a newer version.
     """
     path = run / "config.yaml"
-    content = yaml_content(path, "a run folder's settings (written by rafl-fit)", FORMAT)
+    content = read_yaml_content(path, "a run folder's settings (written by rafl-fit)", FORMAT)
     del content["format"]
     try:
         return Settings(**{**content, "datasets": tuple(content["datasets"])})
@@ -120,41 +123,45 @@ def read_settings(run: Path) -> Settings:
 
 
 def save_tensors(path: Path, content: dict[str, object]) -> None:
-    """Save tensors and plain values, whole or not at all."""
-    with whole_file(path) as temporary:
+    """Save tensors and plain values atomically."""
+    with atomic_file(path) as temporary:
         torch.save(content, temporary)
 
 
-def load_tensors(path: Path, what: str) -> dict:
-    """Load what `save_tensors` wrote; nothing in the file is executed.
+def load_tensors(path: Path, label: str) -> dict[str, Any]:
+    """Load what `save_tensors` wrote. No code in the file is executed.
+
+    Args:
+        path: the file.
+        label: description of the expected content, for error messages.
 
     Raises:
-        InputError: missing, of another kind or damaged.
+        InputError: the file is missing, damaged, of another kind or of a newer version.
     """
-    require_file(path, what)
+    require_file(path, label)
     try:
         content = torch.load(path, weights_only=True)
     except Exception as error:  # torch raises many kinds here; all mean the same to the user
         reason = str(error).splitlines()[0]
-        raise InputError(f"expected {what} in {path}, which cannot be read: {reason:.120}; fit again") from None
+        raise InputError(f"expected {label} in {path}, which cannot be read: {reason:.120}; fit again") from None
     if not isinstance(content, dict) or "method" not in content:
-        raise InputError(f"expected {what} in {path}, found something else; fit again")
+        raise InputError(f"expected {label} in {path}, found something else; fit again")
     check_format(str(content.get("format", "")), FORMAT, path)
     return content
 
 
 @contextmanager
-def understood(what: str, path: Path) -> Iterator[None]:
-    """Where what `load_tensors` found is taken apart: other contents than expected are the file's fault.
+def expect_content(label: str, path: Path) -> Iterator[None]:
+    """Turn errors from using the content that `load_tensors` returned into an error about the file.
 
     Raises:
-        InputError: something is missing, or weights have other names or shapes.
+        InputError: a part is missing, or weights have other names or shapes.
     """
     try:
         yield
     except (LookupError, TypeError, ValueError, AttributeError, RuntimeError) as error:
         reason = str(error).splitlines()[-1].strip() if str(error) else type(error).__name__
-        raise InputError(f"expected {what} in {path}, found other contents: {reason:.120}; fit again") from None
+        raise InputError(f"expected {label} in {path}, found other contents: {reason:.120}; fit again") from None
 
 
 def save_model(run: Path, model: FittedModel) -> None:
@@ -164,51 +171,52 @@ def save_model(run: Path, model: FittedModel) -> None:
         content["field"] = model.field.state_dict()
     if model.material is not None:
         content["material"] = dict(model.material)
-    if model.stepping is not None:
-        content["stepping"] = dict(model.stepping)
+    if model.time_integration is not None:
+        content[TIME_INTEGRATION_KEY] = dict(model.time_integration)
     if model.network is not None:
         content |= {"nodes": model.network.nodes, "network": model.network.state_dict()}
     save_tensors(run / "model.pt", content)
 
 
-def load_model(run: Path) -> FittedModel:
+def load_model(run: str | Path) -> FittedModel:
     """Read `model.pt`.
 
     Raises:
         InputError: missing, damaged, or written by a newer version.
     """
+    run = Path(run)
     content = load_tensors(run / "model.pt", "a fitted model (written by rafl-fit)")
     material = content.get("material")
     if not (material is None or isinstance(material, dict)):
         raise InputError(f"expected identified values by name in {run / 'model.pt'}, found a list; fit again")
-    stepping = content.get("stepping")
-    if stepping is not None and not _steps(stepping):
+    integration = content.get(TIME_INTEGRATION_KEY)
+    if integration is not None and not _is_time_integration(integration):
         raise InputError(
-            f"expected an integrator and substeps in {run / 'model.pt'}, found {stepping!r:.80}; fit again"
+            f"expected an integrator and substeps in {run / 'model.pt'}, found {integration!r:.80}; fit again"
         )
     network = field = None
-    with understood("weights of this version", run / "model.pt"):
+    with expect_content("weights of this version", run / "model.pt"):
         if "network" in content:
             network = GlobalResidual(content["nodes"])
             network.load_state_dict(content["network"])
         if "field" in content:
             field = ResidualField()
             field.restore(content["field"])
-    return FittedModel(content["method"], field, material, network, stepping)
+    return FittedModel(content["method"], field, material, network, integration)
 
 
-def _steps(found: Any) -> bool:
-    """Whether this is what `Simulator.stepping` says."""
-    if not (isinstance(found, dict) and set(found) == {"integrator", "substeps"}):
+def _is_time_integration(content: Any) -> bool:
+    """Whether some content has the form of `Simulator.time_integration`."""
+    if not (isinstance(content, dict) and set(content) == {"integrator", "substeps"}):
         return False
-    return found["integrator"] in INTEGRATORS and isinstance(found["substeps"], int) and found["substeps"] >= 1
+    return content["integrator"] in INTEGRATORS and isinstance(content["substeps"], int) and content["substeps"] >= 1
 
 
-def stale(errors: Sequence[float], patience: int) -> bool:
-    """Whether the last `patience` of the validation errors so far, one an epoch, brought nothing better."""
+def has_stalled(errors: Sequence[float], patience: int) -> bool:
+    """Whether none of the last `patience` validation errors, one per epoch, is the lowest so far."""
     return len(errors) - 1 - int(np.argmin(errors)) >= patience
 
 
 def write_history(run: Path, rows: list[dict[str, float]]) -> None:
-    """Write `history.csv`, a row an epoch."""
+    """Write `history.csv`, one row per epoch."""
     write_text(run / "history.csv", pd.DataFrame(rows).to_csv(index=False))

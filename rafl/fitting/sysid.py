@@ -1,4 +1,4 @@
-"""System identification by exact gradients (paper, SysID baseline): E and nu, E alone, or damping too."""
+"""System identification by exact gradients (paper, SysID baseline): E and nu, E alone, or E, nu and viscosity."""
 
 import itertools
 from dataclasses import dataclass
@@ -20,38 +20,48 @@ from rafl.fitting.run_folder import (
     FORMAT,
     FittedModel,
     Settings,
+    expect_content,
     load_tensors,
     save_model,
     save_tensors,
-    understood,
     write_history,
 )
-from rafl.fitting.train_field import Report, batches, mean_error, prepared, training_items, validation_batches
+from rafl.fitting.train_field import (
+    Report,
+    batches_by_dataset,
+    mean_error,
+    prepare_datasets,
+    training_items,
+    validation_batches,
+)
 
 Array = NDArray[Any]
 
-NEARLY_INCOMPRESSIBLE = 0.499  # nu where E alone is sought, as the paper has it
-STARTS = (0.6, 1.7)  # times the assumed E, where the search begins again
-# Leading frames that the search begins with, as shares of all and at least so many: over many swings the best is
-# hidden behind others, where a simulation is whole swings ahead or behind.
-SHARES, LEAST_FRAMES = (0.15, 0.4), 8
-ROUNDS = 3  # iterations with each of these
-STRIDE = 0.2  # of a variable: the first step
-NORMAL = 1.959964  # 95 % of a normal distribution lie within as many standard deviations
-WALL = 1e6  # the loss where a simulation fails
-TINY = 1e-30  # a loss that is none
-STEP = 1e-3  # of a variable, for the curvature's finite differences of the exact gradient
+FIXED_POISSONS_RATIO = 0.499  # nearly incompressible; where only E is identified, as in the paper
+START_FACTORS = (0.6, 1.7)  # times the assumed E: further starting points
+# Each early stage of the search simulates a fraction of the frames, and a minimum number. Over many oscillations the
+# loss has other minima, where the simulation is whole oscillations ahead or behind.
+FRAME_FRACTIONS = (0.15, 0.4)
+MIN_FRAMES = 8
+ITERATIONS_PER_STAGE = 3
+VARIABLE_SCALE = 0.2  # of every variable, for L-BFGS-B; its first step is about as long
+NORMAL_QUANTILE_95 = 1.959964  # a normal distribution has 95 % within this many standard deviations
+FAILURE_LOSS = 1e6  # loss where a simulation fails
+MIN_LOSS = 1e-30  # smallest divisor, for a loss of zero
+CURVATURE_STEP = 1e-3  # of a variable, for finite differences of the exact gradient
+MIN_REPORTED_CORRELATION = 0.9
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """One number to identify, and the variable in whose scale the search is even.
+    """A parameter to identify, and the transformed variable in which the search is evenly scaled.
 
     Attributes:
         name: in `rafl.simulation.parameters.Parameters`.
         low, high: bounds.
-        kind: `log`: its logarithm; `gap`: the logarithm of 1/2 minus it; `root`: the root of its share of `usual`.
+        kind: the variable is, for a value p, `log`: log p; `gap`: log (1/2 - p); `root`: the square root of p / scale.
         unit: for messages.
+        scale: of `root`, in the unit of the value.
     """
 
     name: str
@@ -59,184 +69,192 @@ class Quantity:
     high: float
     kind: str
     unit: str
-    usual: float = 1.0
+    scale: float = 1.0
 
     def variable(self, value: float) -> float:
-        """Of a value."""
+        """The variable of a value."""
         if self.kind == "log":
             return float(np.log(value))
-        return float(np.log(0.5 - value)) if self.kind == "gap" else float(np.sqrt(value / self.usual))
+        return float(np.log(0.5 - value)) if self.kind == "gap" else float(np.sqrt(value / self.scale))
 
     def value(self, variable: Any) -> Any:
-        """Of a variable, a float or a tensor."""
+        """The value of a variable, a float or a tensor."""
         exp = torch.exp if isinstance(variable, Tensor) else np.exp
         if self.kind == "log":
             return exp(variable)
-        return 0.5 - exp(variable) if self.kind == "gap" else self.usual * variable**2
+        return 0.5 - exp(variable) if self.kind == "gap" else self.scale * variable**2
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """Of the variable."""
+        """Lower and upper bound of the variable."""
         a, b = self.variable(self.low), self.variable(self.high)
         return min(a, b), max(a, b)
 
 
 MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa")
 POISSON = Quantity("poissons_ratio", 0.3, 0.499, "gap", "")
-VISCOSITY = Quantity("viscosity", 0.0, 1e4, "root", "Pa s", usual=100.0)
-SOUGHT = {"sysid": (MODULUS, POISSON), "sysid-e": (MODULUS,), "sysid-damping": (MODULUS, POISSON, VISCOSITY)}
+VISCOSITY = Quantity("viscosity", 0.0, 1e4, "root", "Pa s", scale=100.0)
+METHOD_QUANTITIES = {
+    "sysid": (MODULUS, POISSON),
+    "sysid-e": (MODULUS,),
+    "sysid-damping": (MODULUS, POISSON, VISCOSITY),
+}
 
 
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
-    """Fit material numbers to the training recordings by L-BFGS-B within bounds, from several starts.
+    """Fit material parameters to the training recordings by L-BFGS-B within bounds, from several starting points.
 
-    The search begins at the datasets' assumed material and at softer and stiffer ones, with the recordings' first
-    frames; the best goes on with more and more of them. `parameters.csv` in the run says how sure each number is and
-    which trade off against one another. What a killed run had tried is read from its checkpoint and not simulated
-    again.
+    The search starts from the datasets' assumed material and from a softer and a stiffer one, on the first frames of
+    the recordings. The best result continues with more frames, and finally with all. `parameters.csv` in the run
+    holds the values, their 95 % intervals and their correlations. A resumed run reads earlier simulations from its
+    checkpoint and does not repeat them.
 
     Raises:
-        InputError: no recording to train on.
+        InputError: no training recordings.
         SimulationError: the assumed material itself cannot be simulated.
     """
     search = _Search(datasets, settings, run, report)
-    starts = search.begins()
-    for share in SHARES:
-        search.see(share)
-        starts = [min((search.descend(start, ROUNDS) for start in starts), key=lambda result: result[0])[1]]
-    search.see(1.0)
-    _, found = search.descend(starts[0], max(settings.epochs - ROUNDS * len(SHARES), 1))
-    model = search.model(found)
+    points = search.starting_points()
+    for fraction in FRAME_FRACTIONS:
+        search.use_frames(fraction)
+        results = (search.descend(point, ITERATIONS_PER_STAGE) for point in points)
+        points = [min(results, key=lambda result: result[0])[1]]
+    search.use_frames(1.0)
+    _, best = search.descend(points[0], max(settings.epochs - ITERATIONS_PER_STAGE * len(FRAME_FRACTIONS), 1))
+    model = search.model(best)
     save_model(run, model)
-    write_text(run / "parameters.csv", search.certainty(found))
+    write_text(run / "parameters.csv", search.parameter_table(best))
     return model
 
 
 class _Search:
-    """The objective, what it has been asked so far, and the history."""
+    """The objective, its evaluations so far, and the history."""
 
     def __init__(self, datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> None:
-        cut = prepared(datasets, settings)
-        self.train, self.validate = batches(training_items(cut), settings.by_sigma), validation_batches(cut)
-        self.quantities, self.settings, self.run, self.report = SOUGHT[settings.method], settings, run, report
-        self.simulator = cut[0].simulator
-        self.frames = 0  # that are simulated
+        used = prepare_datasets(datasets, settings)
+        self.training = batches_by_dataset(training_items(used), settings.by_sigma)
+        self.validation = validation_batches(used)
+        self.quantities = METHOD_QUANTITIES[settings.method]
+        self.settings, self.run, self.report = settings, run, report
+        self.simulator = used[0].simulator
+        self.frames = 0  # number of frames to simulate
         self.history: list[dict[str, float]] = []
-        self.known: dict[tuple[float, ...], tuple[float, list[float]]] = {}  # by frames and variables
-        self.file = run / "checkpoint.pt"
-        if self.file.exists():
-            saved = load_tensors(self.file, "a checkpoint of this run")
-            with understood("what was tried", self.file):
-                self.known = {tuple(asked): (loss, slope) for asked, loss, slope in saved["known"]}
+        self.evaluations: dict[tuple[float, ...], tuple[float, list[float]]] = {}  # by frames and variables
+        self.checkpoint = run / "checkpoint.pt"
+        if self.checkpoint.exists():
+            saved = load_tensors(self.checkpoint, "a checkpoint of this run")
+            with expect_content("a checkpoint of this version", self.checkpoint):
+                self.evaluations = {tuple(key): (loss, gradient) for key, loss, gradient in saved["known"]}
 
-    def see(self, share: float) -> None:
-        """Simulate a share of the frames from now on."""
-        longest = max(len(recordings.markers) for recordings in self.train)
-        self.frames = min(max(int(share * longest), LEAST_FRAMES), longest)
+    def use_frames(self, fraction: float) -> None:
+        """Set the fraction of the frames that is simulated."""
+        longest = max(len(recordings.markers) for recordings in self.training)
+        self.frames = min(max(int(fraction * longest), MIN_FRAMES), longest)
 
-    def begins(self) -> list[Array]:
-        """Where to begin: the assumed material first."""
+    def starting_points(self) -> list[Array]:
+        """Variables to start from; those of the assumed material come first."""
         assumed = {q: max(float(getattr(self.simulator.material, q.name)), q.low) for q in self.quantities}
         own = np.array([np.clip(q.variable(value), *q.bounds) for q, value in assumed.items()])
         if self.settings.method == "sysid-damping":
-            own[2] = max(own[2], VISCOSITY.variable(VISCOSITY.usual))
-        result = [own]
-        for factor in STARTS:
+            own[2] = max(own[2], VISCOSITY.variable(VISCOSITY.scale))
+        points = [own]
+        for factor in START_FACTORS:
             other = own.copy()
             other[0] = np.clip(own[0] + np.log(factor), *MODULUS.bounds)
-            result.append(other)
-        return result
+            points.append(other)
+        return points
 
     def values(self, x: Any) -> dict[str, Any]:
-        """Parameters by name, of variables."""
-        found = {q.name: q.value(x[k]) for k, q in enumerate(self.quantities)}
-        return {"poissons_ratio": NEARLY_INCOMPRESSIBLE, **found} if len(found) == 1 else found
+        """Material parameters, by name, of variables x."""
+        identified = {q.name: q.value(x[k]) for k, q in enumerate(self.quantities)}
+        return {"poissons_ratio": FIXED_POISSONS_RATIO, **identified} if len(identified) == 1 else identified
 
     def model(self, x: Array) -> FittedModel:
-        """With the material of variables x."""
+        """The model with the material of variables x."""
         material = {name: float(value) for name, value in self.values(x).items()}
-        return FittedModel(self.settings.method, material=material, stepping=self.simulator.stepping)
+        return FittedModel(self.settings.method, material=material, time_integration=self.simulator.time_integration)
 
     def __call__(self, x: Array) -> tuple[float, Array]:
-        """Loss and its gradient; a high wall where a simulation fails, so that the line search comes back."""
+        """Loss and its gradient. The loss is very high where a simulation fails, so that the line search returns."""
         try:
-            loss, slope = self._asked(x)
+            loss, gradient = self._evaluate(x)
         except SimulationError:
-            if not self.known:
+            if not self.evaluations:
                 raise
-            return WALL, np.zeros(len(x))
-        return loss, np.array(slope)
+            return FAILURE_LOSS, np.zeros(len(x))
+        return loss, np.array(gradient)
 
-    def _asked(self, x: Array) -> tuple[float, list[float]]:
-        """Loss and its gradient, simulated where they are not known yet."""
+    def _evaluate(self, x: Array) -> tuple[float, list[float]]:
+        """Loss and its gradient, from the checkpoint or else simulated."""
         key = (float(self.frames), *(float(value) for value in x))
-        if key not in self.known:
-            self.known[key] = self._simulate(x)
-            content = [[list(asked), loss, slope] for asked, (loss, slope) in self.known.items()]
-            save_tensors(self.file, {"format": FORMAT, "method": self.settings.method, "known": content})
-        return self.known[key]
+        if key not in self.evaluations:
+            self.evaluations[key] = self._simulate(x)
+            content = [[list(each), loss, gradient] for each, (loss, gradient) in self.evaluations.items()]
+            save_tensors(self.checkpoint, {"format": FORMAT, "method": self.settings.method, "known": content})
+        return self.evaluations[key]
 
     def _simulate(self, x: Array) -> tuple[float, list[float]]:
         variables = torch.tensor(x, dtype=torch.float64, requires_grad=True)
         values = self.values(variables)
-        count = sum(len(recordings.names) for recordings in self.train)
+        count = sum(len(recordings.names) for recordings in self.training)
         total = torch.zeros((), dtype=torch.float64)
-        for recordings in (each.first(self.frames) for each in self.train):
+        for recordings in (each.first_frames(self.frames) for each in self.training):
             simulated, forces = recordings.simulate(parameters=recordings.dataset.simulator.parameters(**values))
             total = total + training_loss(recordings, simulated, forces) * len(recordings.names) / count
-        total.backward()
+        torch.autograd.backward(total)
         assert variables.grad is not None
         return total.item(), variables.grad.tolist()
 
     def descend(self, start: Array, iterations: int) -> tuple[float, Array]:
-        """L-BFGS-B from a start; the loss reached, and where."""
-        scale = max(self(start)[0], TINY)
+        """Minimise by L-BFGS-B from a starting point; returns the loss and the variables."""
+        scale = max(self(start)[0], MIN_LOSS)
 
-        def relative(y: Array) -> tuple[float, Array]:
-            loss, slope = self(y * STRIDE)
-            return loss / scale, slope * STRIDE / scale
+        def scaled(y: Array) -> tuple[float, Array]:
+            loss, gradient = self(y * VARIABLE_SCALE)
+            return loss / scale, gradient * VARIABLE_SCALE / scale
 
         if not self.history:
             self.record(start, 0)
-        found = minimize(
-            relative,
-            start / STRIDE,
+        result = minimize(
+            scaled,
+            start / VARIABLE_SCALE,
             jac=True,
             method="L-BFGS-B",
-            bounds=[(q.bounds[0] / STRIDE, q.bounds[1] / STRIDE) for q in self.quantities],
-            callback=lambda y: self.record(y * STRIDE, int(self.history[-1]["epoch"]) + 1),
+            bounds=[(q.bounds[0] / VARIABLE_SCALE, q.bounds[1] / VARIABLE_SCALE) for q in self.quantities],
+            callback=lambda y: self.record(y * VARIABLE_SCALE, int(self.history[-1]["epoch"]) + 1),
             options={"maxiter": iterations, "ftol": 1e-9, "gtol": 1e-8},
         )
-        return scale * float(found.fun), found.x * STRIDE
+        return scale * float(result.fun), result.x * VARIABLE_SCALE
 
     def record(self, x: Array, number: int) -> None:
-        """A row of the history."""
+        """Append a row to the history, write it and report it."""
         model = self.model(x)
         assert model.material is not None
-        error = 1e3 * mean_error(self.validate, model)
+        error = 1e3 * mean_error(self.validation, model)
         self.history.append({"epoch": number, "loss": self(x)[0], "validation_mm": error, **model.material})
         write_history(self.run, self.history)
         self.report(self.history[-1])
 
-    def certainty(self, x: Array) -> str:
-        """As CSV: each value with its 95 % interval, and how they trade off against one another.
+    def parameter_table(self, x: Array) -> str:
+        """CSV text with each value, its 95 % interval and its correlations with the others.
 
-        Markers' errors are taken as independent, of the size of what the fit leaves; the curvature of the loss then
-        is the information. A number at its bound has no interval; none has one where a material beside the best
-        cannot be simulated, or where the search ended short of a minimum.
+        Marker errors are assumed independent and as large as the residuals of the fit; the curvature of the loss then
+        gives the information matrix. A value at its bound has no interval. No value has one if a material near the
+        best cannot be simulated or if the search ended before a minimum.
         """
-        inside = [k for k, q in enumerate(self.quantities) if q.bounds[0] + STEP < x[k] < q.bounds[1] - STEP]
+        lows, highs = zip(*(q.bounds for q in self.quantities), strict=True)
+        inside = [k for k in range(len(x)) if lows[k] + CURVATURE_STEP < x[k] < highs[k] - CURVATURE_STEP]
         covariance = np.full((len(x), len(x)), np.nan)
         curvature = self._curvature(x, inside)
         if curvature is not None and np.linalg.eigvalsh(curvature)[0] > 0.0:
-            seen = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.train)
-            own = 2.0 * self(x)[0] / max(seen - len(x), 1.0) * np.linalg.pinv(curvature)
+            observed = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.training)
+            own = 2.0 * self(x)[0] / max(observed - len(x), 1.0) * np.linalg.pinv(curvature)
             covariance[np.ix_(inside, inside)] = own
         sigma = np.sqrt(np.diag(covariance))
         names = [q.name for q in self.quantities]
         lines = ["name,unit,value,low_95,high_95," + ",".join(f"correlation_{name}" for name in names)]
         for k, q in enumerate(self.quantities):
-            ends = sorted(float(q.value(x[k] + sign * NORMAL * sigma[k])) for sign in (-1.0, 1.0))
+            ends = sorted(float(q.value(x[k] + sign * NORMAL_QUANTILE_95 * sigma[k])) for sign in (-1.0, 1.0))
             signs = [1.0 if item.kind != "gap" else -1.0 for item in self.quantities]
             correlation = [signs[k] * signs[j] * covariance[k, j] / (sigma[k] * sigma[j]) for j in range(len(x))]
             cells = [float(q.value(x[k])), *ends, *correlation]
@@ -244,35 +262,38 @@ class _Search:
         return "\n".join(lines) + "\n"
 
     def _curvature(self, x: Array, chosen: list[int]) -> Array | None:
-        """Second derivatives of the loss by the chosen variables; None of none, or where a simulation fails."""
+        """Second derivatives of the loss with respect to the chosen variables.
+
+        None if no variable is chosen or a simulation fails.
+        """
         columns = []
         for k in chosen:
-            h = STEP * np.eye(len(x))[k]
+            h = CURVATURE_STEP * np.eye(len(x))[k]
             try:
-                ahead, behind = (np.array(self._asked(place)[1]) for place in (x + h, x - h))
+                ahead, behind = (np.array(self._evaluate(point)[1]) for point in (x + h, x - h))
             except SimulationError:
                 return None
-            columns.append((ahead - behind)[chosen] / (2.0 * STEP))
+            columns.append((ahead - behind)[chosen] / (2.0 * CURVATURE_STEP))
         return 0.5 * (np.array(columns) + np.array(columns).T) if columns else None
 
 
-def spoken(table: pd.DataFrame) -> list[str]:
-    """What `parameters.csv`, read as a data frame, says, in sentences."""
+def parameter_sentences(table: pd.DataFrame) -> list[str]:
+    """Sentences about the identified parameters; `table` is `parameters.csv`, read as a data frame."""
     lines = []
     for row in table.to_dict("records"):
         unit = f" {row['unit']}" if isinstance(row["unit"], str) else ""
         interval = f"95 % interval {row['low_95']:.5g} to {row['high_95']:.5g}"
-        interval = (
-            interval
-            if np.isfinite(row["low_95"])
-            else "no interval: at its bound, short of the best fit, or beside a material that cannot be simulated"
-        )
+        if not np.isfinite(row["low_95"]):
+            interval = (
+                "no interval: the value is at its bound, the search ended before a minimum, or a material nearby "
+                "cannot be simulated"
+            )
         lines.append(f"{row['name']} = {row['value']:.5g}{unit} ({interval})")
     for a, b in itertools.combinations(range(len(table)), 2):
         c = float(table[f"correlation_{table['name'][b]}"][a])
-        if abs(c) > 0.9:
+        if abs(c) > MIN_REPORTED_CORRELATION:
             lines.append(
-                f"{table['name'][a]} and {table['name'][b]} trade off against one another (correlation {c:+.3f}): the "
-                "recordings tell them apart poorly"
+                f"{table['name'][a]} and {table['name'][b]} are correlated ({c:+.3f}): the recordings hardly "
+                "distinguish them"
             )
     return lines

@@ -1,4 +1,4 @@
-"""Training the residual acceleration field end to end through the simulator (paper, RAFL objective)."""
+"""End-to-end training of the residual acceleration field through the simulator (paper, RAFL objective)."""
 
 import math
 from collections.abc import Callable
@@ -8,54 +8,56 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from rafl.common.errors import InputError, SimulationError
 from rafl.data.dataset import Dataset, Trajectory
 from rafl.data.objective import Recordings, frame_errors, training_loss
-from rafl.fitting.distributed import Processes, processes
+from rafl.fitting.distributed import ProcessGroup, process_group
 from rafl.fitting.run_folder import (
     FORMAT,
     FittedModel,
     Settings,
+    expect_content,
+    has_stalled,
     load_model,
     load_tensors,
     save_model,
     save_tensors,
-    stale,
-    understood,
     write_history,
 )
-from rafl.fitting.warm_start import can_teach, warm_start
+from rafl.fitting.warm_start import can_fit_targets, pretrain
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.field_force import FieldPoints
 from rafl.simulation.rollout import rollout
 
-GRADIENT_LIMIT = 10.0  # Adam's step does not depend on the size; a diverging rollout's must not enter its memory
-
-LAST_RATE = 0.02  # of the first learning rate
-CHECKPOINT = "checkpoint.pt"
+# Larger gradients are scaled down: Adam's step does not depend on their size, but the huge gradient of a diverging
+# rollout would spoil its moments.
+MAX_GRADIENT_NORM = 10.0
+FINAL_RATE_FRACTION = 0.02  # last learning rate as a fraction of the first
+CHECKPOINT_FILE = "checkpoint.pt"
 
 Report = Callable[[dict[str, float]], None]
 
 
-def shortened(dataset: Dataset, frames: int) -> Dataset:
-    """The dataset with only the first `frames` frames of each recording (all when 0)."""
+def limit_frames(dataset: Dataset, frames: int) -> Dataset:
+    """The dataset with only the first `frames` frames of each recording; 0 for all."""
     if frames == 0:
         return dataset
 
-    def cut(item: Trajectory) -> Trajectory:
+    def limited(item: Trajectory) -> Trajectory:
         arrays = {key: getattr(item, key)[:frames] for key in ("time", "markers", "valid", "sigma")}
         return replace(item, **arrays)
 
-    return replace(dataset, trajectories={name: cut(item) for name, item in dataset.trajectories.items()})
+    return replace(dataset, trajectories={name: limited(item) for name, item in dataset.trajectories.items()})
 
 
-def prepared(datasets: list[Dataset], settings: Settings) -> list[Dataset]:
-    """The datasets with the frames and the integrator to train with."""
-    return [_stepped(shortened(dataset, settings.frames), settings) for dataset in datasets]
+def prepare_datasets(datasets: list[Dataset], settings: Settings) -> list[Dataset]:
+    """The datasets with the frames and the integrator of the settings."""
+    return [_with_integrator(limit_frames(dataset, settings.frames), settings) for dataset in datasets]
 
 
-def _stepped(dataset: Dataset, settings: Settings) -> Dataset:
+def _with_integrator(dataset: Dataset, settings: Settings) -> Dataset:
     if not settings.integrator:
         return dataset
     return replace(dataset, simulator=replace(dataset.simulator, integrator=settings.integrator))
@@ -73,7 +75,7 @@ def training_items(datasets: list[Dataset]) -> list[Item]:
     """The training recordings of some datasets.
 
     Raises:
-        InputError: none.
+        InputError: there are none.
     """
     items = [Item(dataset, name) for dataset in datasets for name in dataset.split("train")]
     if not items:
@@ -85,8 +87,8 @@ def training_items(datasets: list[Dataset]) -> list[Item]:
     return items
 
 
-def batches(items: list[Item], by_sigma: bool = False) -> list[Recordings]:
-    """Recordings simulated together: those of each dataset."""
+def batches_by_dataset(items: list[Item], by_sigma: bool = False) -> list[Recordings]:
+    """One batch of recordings for each dataset; a batch is simulated at once."""
     names: dict[int, list[str]] = {}
     owners = {id(item.dataset): item.dataset for item in items}
     for item in items:
@@ -95,16 +97,16 @@ def batches(items: list[Item], by_sigma: bool = False) -> list[Recordings]:
 
 
 def validation_batches(datasets: list[Dataset]) -> list[Recordings]:
-    """The validation recordings; without any the training recordings validate."""
+    """The validation recordings, or the training recordings if there are none."""
     chosen = [Item(dataset, name) for dataset in datasets for name in dataset.split("val")]
-    return batches(chosen or training_items(datasets))
+    return batches_by_dataset(chosen or training_items(datasets))
 
 
-def mean_error(sets: list[Recordings], model: FittedModel) -> float:
-    """Mean marker error [m] over all frames of some recordings; infinite where a simulation fails."""
-    errors: list[np.ndarray] = []
+def mean_error(batches: list[Recordings], model: FittedModel) -> float:
+    """Mean marker error [m] over all frames of some recordings; infinite if a simulation fails."""
+    errors: list[NDArray[np.float64]] = []
     with torch.no_grad():
-        for recordings in sets:
+        for recordings in batches:
             try:
                 simulator = model.simulator(recordings.dataset.simulator)
                 simulated, _ = recordings.in_simulator(simulator).simulate(
@@ -116,118 +118,125 @@ def mean_error(sets: list[Recordings], model: FittedModel) -> float:
     return float(np.concatenate(errors).mean())
 
 
-def model_to_go_on_from(run: Path) -> FittedModel:
-    """The field that an earlier run trained, or the material that it identified, or both.
+def load_start_model(run: Path) -> FittedModel:
+    """The field or the identified material of an earlier run, or both, to start training from.
 
     Raises:
         InputError: no run there, or one of another method.
     """
     model = load_model(run)
     if model.network is not None:
-        raise InputError(f"expected a run of method rafl or sysid in {run} to go on from, found {model.method}")
+        raise InputError(f"expected a run of method rafl or sysid in {run} to start from, found {model.method}")
     return model
 
 
-def _trained_on(datasets: list[Dataset], settings: Settings) -> tuple[FittedModel, list[Dataset]]:
-    """What training goes on from, and the datasets, all frames, as it uses them: with what that run identified,
-    stepping as it did unless an integrator is asked for."""
-    start = model_to_go_on_from(Path(settings.start)) if settings.start else FittedModel("rafl")
+def _start_and_datasets(datasets: list[Dataset], settings: Settings) -> tuple[FittedModel, list[Dataset]]:
+    """The model that training starts from, and the datasets, all frames, with its material and time integration.
+
+    An integrator in the settings overrides the model's time integration.
+    """
+    start = load_start_model(Path(settings.start)) if settings.start else FittedModel("rafl")
     values: dict[str, Any] = dict(start.material or {})
     used = []
-    for dataset in (_stepped(item, settings) for item in datasets):
+    for dataset in (_with_integrator(item, settings) for item in datasets):
         simulator = dataset.simulator if settings.integrator else start.simulator(dataset.simulator)
         used.append(replace(dataset, simulator=replace(simulator, material=replace(simulator.material, **values))))
     return start, used
 
 
-def nothing_to_follow(datasets: list[Dataset], settings: Settings) -> bool:
-    """Whether a warm start is wanted that no dataset, as it will be trained with, can give."""
-    _, used = _trained_on(datasets, settings)
-    return settings.warm_start > 0 and not any(can_teach(dataset) for dataset in used)
+def pretraining_unavailable(datasets: list[Dataset], settings: Settings) -> bool:
+    """Whether the settings ask for pre-training and no dataset, with its training settings, allows it."""
+    _, used = _start_and_datasets(datasets, settings)
+    return settings.warm_start > 0 and not any(can_fit_targets(dataset) for dataset in used)
 
 
 def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
-    """Train a `ResidualField` by Adam, one step per batch of recordings; the best on the validation set is kept.
+    """Train a `ResidualField` by Adam, one update per batch of recordings, and keep the best on the validation set.
 
-    Where a field makes a simulation fail, the best so far takes its place, the learning rate is halved, and training
-    goes on with the next batch.
+    If the field makes a simulation fail, the best field so far replaces it, the learning rate is halved, and training
+    continues with the next batch.
 
-    After every epoch `checkpoint.pt`, `model.pt` and `history.csv` in `run` are up to date; called again
-    with the same settings it goes on from there and ends with the weights of an uninterrupted run. Under
-    torchrun every batch is shared out to the processes, and process 0 writes.
+    `checkpoint.pt`, `model.pt` and `history.csv` in `run` are written after every epoch. A second call with the same
+    settings resumes from the checkpoint and ends with the weights of an uninterrupted run. Under torchrun the
+    processes share every batch, and process 0 writes.
 
     Args:
         datasets: one or more specimens.
-        settings: how.
+        settings: of the training.
         run: folder of the run.
         report: called with each epoch's history row.
 
     Raises:
-        InputError: nothing to train on, or a checkpoint that is not of this run.
+        InputError: no training recordings, or a checkpoint of another run.
         SimulationError: every rollout of an epoch failed; names recording and step.
     """
-    with processes() as group:
-        return _Training(datasets, settings, run, report, group).go()
+    with process_group() as group:
+        return _Training(datasets, settings, run, report, group).train()
 
 
 class _Training:
-    """One process's part of a training."""
+    """The training in one of the processes."""
 
     def __init__(
-        self, datasets: list[Dataset], settings: Settings, run: Path, report: Report, group: Processes
+        self, datasets: list[Dataset], settings: Settings, run: Path, report: Report, group: ProcessGroup
     ) -> None:
         self.settings, self.run, self.group = settings, run, group
-        self.report: Report = report if group.first else lambda row: None
-        start, whole = _trained_on(datasets, settings)
-        datasets = [shortened(dataset, settings.frames) for dataset in whole]
-        self.items, self.validate = training_items(datasets), validation_batches(datasets)
+        self.report: Report = report if group.is_main else lambda row: None
+        start, full_length = _start_and_datasets(datasets, settings)
+        datasets = [limit_frames(dataset, settings.frames) for dataset in full_length]
+        self.items, self.validation = training_items(datasets), validation_batches(datasets)
         self.history: list[dict[str, float]] = []
         torch.manual_seed(settings.seed)
         self.field = ResidualField() if start.field is None else start.field
-        self.model = FittedModel("rafl", self.field, start.material, stepping=datasets[0].simulator.stepping)
-        if not (run / CHECKPOINT).exists():
+        integration = datasets[0].simulator.time_integration
+        self.model = FittedModel("rafl", self.field, start.material, time_integration=integration)
+        if not (run / CHECKPOINT_FILE).exists():
             if start.field is None:
-                self._prepare(datasets)
-            warm_start(
+                self._initialise_field(datasets)
+            pretrain(
                 self.field,
-                whole,
+                full_length,
                 run,
                 settings.warm_start,
                 settings.seed,
-                lambda: 1e3 * mean_error(self.validate, self.model),
+                self._validation_mm,
                 self.report,
-                learned=start.field is not None,
+                trained=start.field is not None,
             )
         self.optimiser = torch.optim.Adam(
             self.field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
         )
         self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
-            self.optimiser, settings.epochs, eta_min=LAST_RATE * settings.learning_rate
+            self.optimiser, settings.epochs, eta_min=FINAL_RATE_FRACTION * settings.learning_rate
         )
         self.shuffle = torch.Generator().manual_seed(settings.seed)
 
-    def _prepare(self, datasets: list[Dataset]) -> None:
-        """A new field's symmetry and scale."""
-        taught = [dataset for dataset in datasets if dataset.split("train")]
-        mirrors = np.logical_and.reduce([dataset.simulator.mirrors for dataset in taught])
-        self.field.mirror(torch.from_numpy(mirrors))
-        samples = torch.cat([_sample_features(dataset) for dataset in taught])
-        self.field.scale_to(samples.square().mean(0).sqrt())
+    def _initialise_field(self, datasets: list[Dataset]) -> None:
+        """Set the symmetry and the scale of a new field from the training datasets."""
+        training = [dataset for dataset in datasets if dataset.split("train")]
+        mirrors = np.logical_and.reduce([dataset.simulator.symmetry_planes for dataset in training])
+        self.field.impose_symmetry(torch.from_numpy(mirrors))
+        samples = torch.cat([_sample_features(dataset) for dataset in training])
+        self.field.set_scale(samples.square().mean(0).sqrt())
 
-    def go(self) -> FittedModel:
-        """Train to the end."""
-        if (self.run / CHECKPOINT).exists():
+    def _validation_mm(self) -> float:
+        """The model's validation error [mm]."""
+        return 1e3 * mean_error(self.validation, self.model)
+
+    def train(self) -> FittedModel:
+        """Train until the last epoch or until the validation error has stalled."""
+        if (self.run / CHECKPOINT_FILE).exists():
             self._resume()
         else:
-            self.group.wait()  # nobody looks for the checkpoint any more
-            first = self.group.agree(1e3 * mean_error(self.validate, self.model))
+            self.group.wait()  # until no process checks for the checkpoint any more
+            first = self.group.broadcast(self._validation_mm())
             self.history.append({"epoch": 0, "loss": math.nan, "validation_mm": first, "learning_rate": 0.0})
             self._save(best=True)
-        while self.history[-1]["epoch"] < self.settings.epochs and not self._stale():
-            loss, failed = self._epoch()
+        while self.history[-1]["epoch"] < self.settings.epochs and not self._has_stalled():
+            loss, failed = self._run_epoch()
             rate = float(self.optimiser.param_groups[0]["lr"])
             self.schedule.step()
-            error = self.group.agree(1e3 * mean_error(self.validate, self.model))
+            error = self.group.broadcast(self._validation_mm())
             best = error < min(row["validation_mm"] for row in self.history)
             epoch = self.history[-1]["epoch"] + 1
             row = {"epoch": epoch, "loss": loss, "validation_mm": error, "learning_rate": rate}
@@ -236,58 +245,58 @@ class _Training:
         self.group.wait()
         return load_model(self.run)
 
-    def _stale(self) -> bool:
-        return stale([row["validation_mm"] for row in self.history], self.settings.patience)
+    def _has_stalled(self) -> bool:
+        return has_stalled([row["validation_mm"] for row in self.history], self.settings.patience)
 
-    def _epoch(self) -> tuple[float, int]:
-        """Mean loss of one pass over the recordings, and how many updates failed."""
+    def _run_epoch(self) -> tuple[float, int]:
+        """Mean loss of one pass over the recordings, and the number of failed updates."""
         total, count, failed = 0.0, 0, 0
         order = torch.randperm(len(self.items), generator=self.shuffle).tolist()
         for first in range(0, len(order), self.settings.batch):
-            together = [self.items[k] for k in order[first : first + self.settings.batch]]
+            batch = [self.items[k] for k in order[first : first + self.settings.batch]]
             try:
-                total += len(together) * self._update(together)
-                count += len(together)
+                total += len(batch) * self._update(batch)
+                count += len(batch)
             except SimulationError:
                 failed += 1
                 if first + self.settings.batch >= len(order) and count == 0:
                     raise
-                self._retreat()
+                self._restore_best()
         return total / count, failed
 
-    def _update(self, together: list[Item]) -> float:
-        """One step of the optimiser; the batch's mean loss.
+    def _update(self, batch: list[Item]) -> float:
+        """Update the weights once; returns the batch's mean loss.
 
         Raises:
             SimulationError: a simulation failed in one of the processes; raised in all.
         """
         self.optimiser.zero_grad()
         mean, failures = torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
-        reason = f"a simulation of {', '.join(item.name for item in together)} failed in epoch {len(self.history)}"
+        reason = f"a simulation of {', '.join(item.name for item in batch)} failed in epoch {len(self.history)}"
         try:
-            for recordings in batches(self.group.mine(together), self.settings.by_sigma):
+            for recordings in batches_by_dataset(self.group.share(batch), self.settings.by_sigma):
                 force = self.field.on(recordings.dataset.simulator, torch.float32)
                 simulated, forces = recordings.simulate(force)
                 loss = training_loss(recordings, simulated, forces, self.settings.force_penalty)
-                loss = loss * len(recordings.names) / len(together)
-                loss.backward()
+                loss = loss * len(recordings.names) / len(batch)
+                torch.autograd.backward(loss)
                 mean += loss.detach()
         except SimulationError as error:
             failures += 1.0
             reason = f"{reason}: {error}"
         gradients = [torch.zeros_like(p) if p.grad is None else p.grad for p in self.field.parameters()]
-        self.group.add_up([*gradients, mean, failures])
+        self.group.sum_over_processes([*gradients, mean, failures])
         for parameter, gradient in zip(self.field.parameters(), gradients, strict=True):
             parameter.grad = gradient
-        size = torch.nn.utils.clip_grad_norm_(self.field.parameters(), GRADIENT_LIMIT)
-        if failures > 0 or not torch.isfinite(size):
+        norm = torch.nn.utils.clip_grad_norm_(self.field.parameters(), MAX_GRADIENT_NORM)
+        if failures > 0 or not torch.isfinite(norm):
             raise SimulationError(f"{reason}; lower the learning rate")
         self.optimiser.step()
         return mean.item()
 
-    def _retreat(self) -> None:
-        """To the best field so far, with half the learning rate and nothing in Adam's memory."""
-        self.group.wait()  # what process 0 wrote is read
+    def _restore_best(self) -> None:
+        """Return to the best field so far, halve the learning rate and clear Adam's moments."""
+        self.group.wait()  # until process 0 has written the model
         best = load_model(self.run).field
         assert best is not None
         self.field.load_state_dict(best.state_dict())
@@ -296,8 +305,8 @@ class _Training:
             group["lr"] *= 0.5
 
     def _resume(self) -> None:
-        saved = load_tensors(self.run / CHECKPOINT, "a checkpoint of this run")
-        with understood("a checkpoint of this version", self.run / CHECKPOINT):
+        saved = load_tensors(self.run / CHECKPOINT_FILE, "a checkpoint of this run")
+        with expect_content("a checkpoint of this version", self.run / CHECKPOINT_FILE):
             self.field.restore(saved["field"])
             self.optimiser.load_state_dict(saved["optimiser"])
             self.schedule.load_state_dict(saved["schedule"])
@@ -305,7 +314,8 @@ class _Training:
             self.history = [{**row} for row in saved["history"]]
 
     def _save(self, best: bool) -> None:
-        if self.group.first:
+        """Write the model, if it is the best so far, the checkpoint and the history; report the last epoch."""
+        if self.group.is_main:
             if best:
                 save_model(self.run, self.model)
             content: dict[str, object] = {
@@ -317,13 +327,13 @@ class _Training:
                 "shuffle": self.shuffle.get_state(),
                 "history": self.history,
             }
-            save_tensors(self.run / CHECKPOINT, content)
+            save_tensors(self.run / CHECKPOINT_FILE, content)
             write_history(self.run, self.history)
         self.report(self.history[-1])
 
 
 def _sample_features(dataset: Dataset) -> torch.Tensor:
-    """Features along the untouched simulator's motion, every tenth step from the last."""
+    """Features (S, 34) along the baseline simulator's motion, every tenth step counted back from the last."""
     simulator, names = dataset.simulator, dataset.split("train")
     steps = max(len(dataset.trajectories[name].time) for name in names) - 1
     with torch.no_grad():

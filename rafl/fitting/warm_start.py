@@ -1,9 +1,8 @@
-"""A residual field's first lesson: the least forces that let the simulator follow the recordings step by step.
+"""Pre-training of a residual field: a fit to residual targets, from which end-to-end training starts.
 
-Fitting the field to these forces takes no simulation. What a wrong force would do is measured by the work it would do
-on the body at rest, which weighs bending and the stiff cross-sections fairly. End-to-end training starts from there.
-Forces that follow every vertex exactly are a worse lesson: most of them is noise and stiff modes that a field fitted
-to them does not damp.
+The fit itself needs no simulation. Its loss measures an error in force by the work that the error would do on the
+specimen at rest. That weights bending and the stiff deformations of cross-sections fairly. Forces that follow every
+vertex exactly are worse targets: they are mostly noise and stiff modes, which a field fitted to them does not damp.
 """
 
 from collections.abc import Callable
@@ -16,159 +15,176 @@ from torch import Tensor
 
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import Dataset
-from rafl.fitting.residual_targets import can_be_followed, training_targets
+from rafl.fitting.residual_targets import supports_residual_targets, training_targets
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.features import FEATURES
-from rafl.residual.field_force import FieldPoints, accelerations
-from rafl.residual.field_kernels import KEPT_TURN
+from rafl.residual.field_force import FieldPoints, layer_outputs
+from rafl.residual.field_kernels import SAVED_ROTATION
 from rafl.simulation.simulator import Simulator
 
-RATE = 3e-3  # Adam's, at the start of the cosine decay
-DECAY = 0.3  # of the weights, a unit of rate: without it the field is wilder on shapes it has not seen
-BATCH = 16  # states an update
-MARKERS = 48  # that are followed at most: more tell hardly more
-ENOUGH = 0.1  # gain that ends a step's iteration: a lesson from forces to 1e-8 is no better
-LARGEST = 4000  # vertices: beyond, the body's compliance does not fit as a full matrix
-MOST_POINTS = 12_000_000  # quadrature points of a dataset's states, 172 bytes each: fewer recordings are followed
-TOGETHER = 32  # states whose features are worked out at once
-COLUMNS = 512  # of the compliance, likewise
+LEARNING_RATE = 3e-3  # initial learning rate of Adam; it decays as a cosine
+WEIGHT_DECAY = 0.3  # of AdamW; without it the field varies more on shapes that it was not trained on
+BATCH_STATES = 16  # states per update
+MAX_MARKERS = 48  # markers to follow; more add hardly any information
+MIN_RELATIVE_GAIN = 0.1  # ends a step's iteration; targets converged to 1e-8 give no better field
+MAX_VERTICES = 4000  # of a mesh: the compliance matrix of a larger one does not fit in memory
+MAX_QUADRATURE_POINTS = 12_000_000  # over all states of a dataset, 172 bytes each; limits the number of recordings
+STATES_PER_CHUNK = 32  # states whose features are computed at once
+COLUMNS_PER_CHUNK = 512  # columns of the compliance matrix that are computed at once
 
 
-class Lesson:
-    """One dataset's states, ready for updates in single precision."""
+class TargetFit:
+    """The states and residual targets of one dataset, and the loss of a field on them, in single precision.
+
+    Attributes:
+        states: number of states S.
+        inputs: features at all quadrature points of a state, (34, S, P).
+        rotation: from the co-rotated frame to the specimen frame, (S, P, 3, 3).
+        feature_rms: root mean square of each feature, (34).
+        point_mass: mass of each point [kg], distributed to the nodes by the shape functions; 0 for fixed nodes, (P, N).
+        compliance: displacements of the specimen at rest under unit forces [m/N], (3 N, 3 N).
+        force: residual targets [N], (S, 3 N).
+        work: mean work of the targets [J].
+    """
 
     def __init__(self, dataset: Dataset, targets: Path) -> None:
         simulator = dataset.simulator
         points = FieldPoints.of(simulator)
-        each = 8 * len(points.hexes)
-        most = max(MOST_POINTS // each, BATCH)
-        chosen = _as_many_as_fit(dataset, most)
-        q, v, missing = (part.numpy() for part in training_targets(chosen, targets, MARKERS, ENOUGH))
-        if len(q) > most:
-            drawn = np.sort(np.random.default_rng(0).choice(len(q), most, replace=False))
-            q, v, missing = q[drawn], v[drawn], missing[drawn]
+        count = 8 * len(points.hexes)
+        max_states = max(MAX_QUADRATURE_POINTS // count, BATCH_STATES)
+        limited = _limit_recordings(dataset, max_states)
+        q, v, force = (part.numpy() for part in training_targets(limited, targets, MAX_MARKERS, MIN_RELATIVE_GAIN))
+        if len(q) > max_states:
+            drawn = np.sort(np.random.default_rng(0).choice(len(q), max_states, replace=False))
+            q, v, force = q[drawn], v[drawn], force[drawn]
         nodes = q.shape[1]
         self.states = states = len(q)
-        self.inputs = torch.empty(FEATURES, states, each)
-        self.turn = torch.empty(states, each, 3, 3)
+        self.inputs = torch.empty(FEATURES, states, count)
+        self.rotation = torch.empty(states, count, 3, 3)
         squares = np.zeros(FEATURES)
-        for first in range(0, states, TOGETHER):
-            some = slice(first, first + TOGETHER)
-            inputs, kept = points.features(np.ascontiguousarray(q[some]), np.ascontiguousarray(v[some]))
+        for first in range(0, states, STATES_PER_CHUNK):
+            chunk = slice(first, first + STATES_PER_CHUNK)
+            inputs, saved = points.features(np.ascontiguousarray(q[chunk]), np.ascontiguousarray(v[chunk]))
             squares += (inputs**2).sum(axis=1)
-            self.inputs[:, some] = torch.from_numpy(inputs).reshape(FEATURES, -1, each)
-            turn = kept[:, :, KEPT_TURN : KEPT_TURN + 9].transpose(0, 1, 3, 2)
-            self.turn[some] = torch.from_numpy(turn).reshape(-1, each, 3, 3)
-        self.size = np.sqrt(squares / (states * each))
-        shares = np.zeros((each, nodes), np.float32)
+            self.inputs[:, chunk] = torch.from_numpy(inputs).reshape(FEATURES, -1, count)
+            rotation = saved[:, :, SAVED_ROTATION : SAVED_ROTATION + 9].transpose(0, 1, 3, 2)
+            self.rotation[chunk] = torch.from_numpy(rotation).reshape(-1, count, 3, 3)
+        self.feature_rms = np.sqrt(squares / (states * count))
+        point_mass = np.zeros((count, nodes), np.float32)
         for cell, corners in enumerate(points.hexes):
-            shares[8 * cell : 8 * cell + 8, corners] = points.shape * points.mass[cell][:, None]
-        shares[:, simulator.fixed] = 0.0
-        self.shares = torch.from_numpy(shares)
+            point_mass[8 * cell : 8 * cell + 8, corners] = points.shape * points.mass[cell][:, None]
+        point_mass[:, simulator.fixed] = 0.0
+        self.point_mass = torch.from_numpy(point_mass)
         self.compliance = _compliance(simulator)
-        self.force = torch.from_numpy(missing.reshape(states, -1).astype(np.float32))
-        self.work = self._work(self.force)
+        self.force = torch.from_numpy(force.reshape(states, -1).astype(np.float32))
+        self.work = self._mean_work(self.force)
 
-    def _work(self, force: Tensor) -> Tensor:
+    def _mean_work(self, force: Tensor) -> Tensor:
+        """Mean over states of the work of forces (S, 3 N) [N] on the displacements that they cause [J]."""
         return ((force @ self.compliance) * force).sum(1).mean()
 
     def loss(self, field: ResidualField, chosen: Tensor) -> Tensor:
-        """Work of the force still missing in some states, as a share of all that was missing at first."""
-        points = accelerations(self.inputs[:, chosen].flatten(1), field.weights(torch.float32))[-1]
-        acceleration = points.reshape(3, len(chosen), -1).permute(1, 2, 0)
-        pull = (self.turn[chosen] @ acceleration[..., None])[..., 0]
-        force = torch.einsum("pn,bpi->bni", self.shares, pull).flatten(1)
-        return self._work(force - self.force[chosen]) / self.work
+        """Work of the error in force in the chosen states, as a fraction of the work of all targets."""
+        points = layer_outputs(self.inputs[:, chosen].flatten(1), field.weights(torch.float32))[-1]
+        corotated = points.reshape(3, len(chosen), -1).permute(1, 2, 0)
+        acceleration = (self.rotation[chosen] @ corotated[..., None])[..., 0]
+        force = torch.einsum("pn,bpi->bni", self.point_mass, acceleration).flatten(1)
+        return self._mean_work(force - self.force[chosen]) / self.work
 
 
-def _as_many_as_fit(dataset: Dataset, states: int) -> Dataset:
-    """The training recordings, evenly left out where they have more states than that; one at least."""
+def _limit_recordings(dataset: Dataset, max_states: int) -> Dataset:
+    """As many evenly spaced training recordings as have about `max_states` states in total; at least one."""
     names = dataset.split("train")
     steps = max(len(dataset.trajectories[name].time) - 1 for name in names)
-    count = min(max(states // max(steps, 1), 1), len(names))
+    count = min(max(max_states // max(steps, 1), 1), len(names))
     kept = [names[k] for k in np.unique(np.linspace(0, len(names) - 1, count).round().astype(int))]
     return replace(dataset, trajectories={name: dataset.trajectories[name] for name in kept})
 
 
 def _compliance(simulator: Simulator) -> Tensor:
-    """Displacements [m] of the body at rest by unit forces on its nodes, (3 N, 3 N)."""
+    """Displacements of the specimen at rest under unit forces on its nodes [m/N], (3 N, 3 N)."""
     rest, size = simulator.mesh.vertices[None], 3 * len(simulator.mesh.vertices)
     compliance = torch.empty(size, size)
-    for first in range(0, size, COLUMNS):
-        unit = np.eye(size, min(COLUMNS, size - first), -first).reshape(1, size // 3, 3, -1)
-        compliance[:, first : first + COLUMNS] = torch.from_numpy(simulator.solve_tangent(rest, unit)).reshape(size, -1)
+    for first in range(0, size, COLUMNS_PER_CHUNK):
+        unit = np.eye(size, min(COLUMNS_PER_CHUNK, size - first), -first).reshape(1, size // 3, 3, -1)
+        solution = torch.from_numpy(simulator.solve_tangent(rest, unit)).reshape(size, -1)
+        compliance[:, first : first + COLUMNS_PER_CHUNK] = solution
     return compliance
 
 
-def can_teach(dataset: Dataset) -> bool:
-    """Whether a warm start learns from it: training recordings that can be followed, on a mesh not too large."""
-    small = len(dataset.simulator.mesh.vertices) <= LARGEST
-    return small and bool(dataset.split("train")) and can_be_followed(dataset.simulator)
+def can_fit_targets(dataset: Dataset) -> bool:
+    """Whether pre-training can use a dataset: training recordings, a supported simulator, at most 4000 vertices."""
+    small = len(dataset.simulator.mesh.vertices) <= MAX_VERTICES
+    return small and bool(dataset.split("train")) and supports_residual_targets(dataset.simulator)
 
 
-def warm_start(
+def pretrain(
     field: ResidualField,
     datasets: list[Dataset],
     run: Path,
     epochs: int,
     seed: int,
-    judge: Callable[[], float],
+    validate: Callable[[], float],
     report: Callable[[dict[str, float]], None],
-    learned: bool = False,
+    trained: bool = False,
 ) -> None:
-    """Fit a field, in place, to the forces that the training recordings call for.
+    """Fit a field, in place, to the residual targets of the training recordings.
 
-    Of datasets only those count that can teach. What fits the recorded states best need not be stable beside them:
-    of all epochs the one is kept that simulates best.
+    Datasets that do not allow it are skipped. The best fit to the recorded states need not be stable near them, so
+    the weights of the epoch with the lowest error in simulation are kept.
 
     Args:
         field: to be trained.
         datasets: any.
-        run: folder that keeps the forces, `targets-<dataset>.pt`.
-        epochs: passes over the states; 0 leaves the weights as they are.
+        run: folder for the targets, `targets-<number>.pt`.
+        epochs: passes over the states; 0 leaves the weights unchanged.
         seed: of the order of states.
-        judge: the field's error in simulation [mm].
-        report: called after each epoch with `warm_start` (its number), `missing` (the share of the missing force's
-            effect, root mean square, that the field does not give) and `validation_mm`.
-        learned: whether the field goes on from an earlier training; one that does not is scaled to these states.
+        validate: returns the field's error in simulation [mm].
+        report: called after each epoch with `warm_start` (its number), `missing` (the error in force as a fraction of
+            the targets, root mean square in the norm of the loss) and `validation_mm`.
+        trained: whether the field was trained before; a new field's scale is set from the states.
+
+    Raises:
+        SimulationError: the targets cannot be computed.
     """
     if epochs == 0:
         return
     try:
-        lessons = [
-            Lesson(dataset, run / f"targets-{number}.pt")
+        fits = [
+            TargetFit(dataset, run / f"targets-{number}.pt")
             for number, dataset in enumerate(datasets)
-            if can_teach(dataset)
+            if can_fit_targets(dataset)
         ]
     except SimulationError as error:
-        raise SimulationError(f"{error}; train without following the recordings first: --warm-start 0") from None
-    if not lessons:
+        raise SimulationError(f"{error}; train without pre-training: --warm-start 0") from None
+    if not fits:
         return
-    if not learned:
+    if not trained:
         with torch.no_grad():
-            field.scale_to(torch.from_numpy(np.sqrt(np.mean([lesson.size**2 for lesson in lessons], axis=0))))
-    optimiser = torch.optim.AdamW(field.parameters(), lr=RATE, weight_decay=DECAY)
+            field.set_scale(torch.from_numpy(np.sqrt(np.mean([fit.feature_rms**2 for fit in fits], axis=0))))
+    optimiser = torch.optim.AdamW(field.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
     order = torch.Generator().manual_seed(seed)
-    batches = sum(max(lesson.states // BATCH, 1) for lesson in lessons)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(epochs * batches, 1), eta_min=0.01 * RATE)
-    errors, kept = [judge()], {key: value.clone() for key, value in field.state_dict().items()}
+    updates = epochs * sum(max(fit.states // BATCH_STATES, 1) for fit in fits)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(updates, 1), eta_min=0.01 * LEARNING_RATE)
+    errors, kept = [validate()], {key: value.clone() for key, value in field.state_dict().items()}
     for epoch in range(epochs):
         total = 0.0
-        turns = [
-            (lesson, chosen)
-            for lesson in lessons
-            for chosen in torch.randperm(lesson.states, generator=order).split(BATCH)[: max(lesson.states // BATCH, 1)]
-        ]
-        for k in torch.randperm(len(turns), generator=order):
-            lesson, chosen = turns[k]
+        batches = [(fit, chosen) for fit in fits for chosen in _state_batches(fit.states, order)]
+        for k in torch.randperm(len(batches), generator=order):
+            fit, chosen = batches[k]
             optimiser.zero_grad()
-            loss = lesson.loss(field, chosen)
-            loss.backward()
+            loss = fit.loss(field, chosen)
+            torch.autograd.backward(loss)
             optimiser.step()
             schedule.step()
             total += loss.item()
-        errors.append(judge())
-        report({"warm_start": epoch + 1, "missing": float(np.sqrt(total / len(turns))), "validation_mm": errors[-1]})
+        errors.append(validate())
+        report({"warm_start": epoch + 1, "missing": float(np.sqrt(total / len(batches))), "validation_mm": errors[-1]})
         if errors[-1] < min(errors[:-1]):
             kept = {key: value.clone() for key, value in field.state_dict().items()}
     field.load_state_dict(kept)
+
+
+def _state_batches(states: int, order: torch.Generator) -> tuple[Tensor, ...]:
+    """Random batches of state numbers; an incomplete last batch is dropped unless it is the only one."""
+    return torch.split(torch.randperm(states, generator=order), BATCH_STATES)[: max(states // BATCH_STATES, 1)]

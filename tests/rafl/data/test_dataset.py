@@ -12,7 +12,7 @@ from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
 
 
-def test_round_trip(dataset: Dataset, tmp_path: Path) -> None:
+def test_written_dataset_is_read_back_unchanged(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     material = replace(dataset.simulator.material, viscosity=12.0, integration="selective")
     simulator = replace(dataset.simulator, material=material, integrator="generalised-alpha", substeps=3)
@@ -35,7 +35,7 @@ def test_round_trip(dataset: Dataset, tmp_path: Path) -> None:
     assert back.split("train") == ["a", "b"]
 
 
-def test_a_newer_version_is_refused_by_name(dataset: Dataset, tmp_path: Path) -> None:
+def test_newer_format_version_is_refused_by_name(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write_dataset(path, dataset)
     with h5py.File(path, "r+") as file:
@@ -44,14 +44,14 @@ def test_a_newer_version_is_refused_by_name(dataset: Dataset, tmp_path: Path) ->
         read_dataset(path)
 
 
-def test_damage_is_noticed(dataset: Dataset, tmp_path: Path) -> None:
-    """A flipped byte in the markers fails its checksum; a cut file does not open."""
+def test_damaged_file_is_refused(dataset: Dataset, tmp_path: Path) -> None:
+    """A flipped bit in the markers fails the checksum; a truncated file does not open."""
     path = tmp_path / "a.h5"
     write_dataset(path, dataset)
     content = path.read_bytes()
-    needle = dataset.trajectories["b"].markers.tobytes()[:64]
-    place = content.index(needle) + 8
-    path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+    pattern = dataset.trajectories["b"].markers.tobytes()[:64]
+    offset = content.index(pattern) + 8
+    path.write_bytes(content[:offset] + bytes([content[offset] ^ 1]) + content[offset + 1 :])
     with pytest.raises(InputError, match="cannot be read"):
         read_dataset(path)
     path.write_bytes(content[: len(content) // 2])
@@ -59,7 +59,7 @@ def test_damage_is_noticed(dataset: Dataset, tmp_path: Path) -> None:
         read_dataset(path)
 
 
-def test_an_empty_dataset_is_refused(dataset: Dataset, tmp_path: Path) -> None:
+def test_empty_dataset_is_refused(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write_dataset(path, Dataset(dataset.name, dataset.simulator, dataset.markers, {}))
     with pytest.raises(InputError, match="at least one trajectory"):
@@ -67,7 +67,7 @@ def test_an_empty_dataset_is_refused(dataset: Dataset, tmp_path: Path) -> None:
 
 
 def content(path: Path, name: str) -> dict[str, bytes]:
-    """Everything in a recording of a file."""
+    """All arrays and attributes of a recording in a file."""
     found = {}
     with h5py.File(path) as file:
         group = file[f"trajectories/{name}"]
@@ -76,7 +76,7 @@ def content(path: Path, name: str) -> dict[str, bytes]:
     return found
 
 
-def test_one_recording_is_replaced_or_added_and_the_others_stay(dataset: Dataset, tmp_path: Path) -> None:
+def test_update_replaces_or_adds_recordings_and_keeps_the_others(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write_dataset(path, dataset)
     before = {name: content(path, name) for name in dataset.trajectories}
@@ -86,11 +86,15 @@ def test_one_recording_is_replaced_or_added_and_the_others_stay(dataset: Dataset
     for name in ("a", "c", "d"):
         assert content(path, name) == before[name]
     assert read_dataset(path).trajectories["b"].split == "test"
-    assert read_dataset(path).recipe == "by a test\n# then\nmore"
+    assert read_dataset(path).recipe == f"{dataset.recipe}\n# then\nmore"
     assert damaged_parts(path) == []
     other = replace(dataset, simulator=replace(dataset.simulator, mesh=dataset.simulator.mesh.scaled((1.1, 1, 1))))
     twice = replace(dataset, simulator=replace(dataset.simulator, substeps=2))
-    for wrong, message in ((other, "another mesh"), (at_step(dataset, 0.0102), "frames/s"), (twice, "substeps 1")):
+    for wrong, message in (
+        (other, "another mesh"),
+        (with_time_step(dataset, 0.0102), "frames/s"),
+        (twice, "substeps 1"),
+    ):
         with pytest.raises(InputError, match=message):
             update_dataset(path, wrong)
     assert content(path, "a") == before["a"]
@@ -98,20 +102,20 @@ def test_one_recording_is_replaced_or_added_and_the_others_stay(dataset: Dataset
         update_dataset(tmp_path / "none.h5", dataset)
 
 
-def at_step(dataset: Dataset, step: float) -> Dataset:
+def with_time_step(dataset: Dataset, step: float) -> Dataset:
     return replace(dataset, simulator=replace(dataset.simulator, time_step=step))
 
 
-def test_recordings_of_nearly_the_same_rate_are_added(dataset: Dataset, tmp_path: Path) -> None:
-    """The file's own time step stays."""
+def test_update_tolerates_a_slightly_different_frame_rate(dataset: Dataset, tmp_path: Path) -> None:
+    """The time step of the file does not change."""
     path = tmp_path / "a.h5"
     write_dataset(path, dataset)
-    update_dataset(path, replace(at_step(dataset, 0.01002), trajectories={"e": dataset.trajectories["a"]}))
+    update_dataset(path, replace(with_time_step(dataset, 0.01002), trajectories={"e": dataset.trajectories["a"]}))
     assert read_dataset(path).simulator.time_step == dataset.simulator.time_step
     assert "e" in read_dataset(path).trajectories
 
 
-def test_changed_numbers_and_words_are_found(dataset: Dataset, tmp_path: Path) -> None:
+def test_changed_arrays_and_attributes_are_found(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
     write_dataset(path, dataset)
     assert damaged_parts(path) == []
@@ -127,20 +131,17 @@ def test_changed_numbers_and_words_are_found(dataset: Dataset, tmp_path: Path) -
         damaged_parts(path)
 
 
-def test_every_array_says_its_unit_and_frame(dataset: Dataset, tmp_path: Path) -> None:
+def test_every_array_has_a_unit_and_a_frame(dataset: Dataset, tmp_path: Path) -> None:
     write_dataset(tmp_path / "a.h5", dataset)
     missing = []
 
-    def look(name: str, item: h5py.Group | h5py.Dataset) -> None:
-        if (
-            isinstance(item, h5py.Dataset)
-            and name != "markers/names"
-            and not (item.attrs["unit"] and item.attrs["frame"])
-        ):
+    def check(name: str, item: h5py.Group | h5py.Dataset) -> None:
+        numeric = isinstance(item, h5py.Dataset) and name != "markers/names"
+        if numeric and not (item.attrs["unit"] and item.attrs["frame"]):
             missing.append(name)
 
     with h5py.File(tmp_path / "a.h5") as file:
-        file.visititems(look)
+        file.visititems(check)
         assert file["trajectories/a/initial/v"].attrs["unit"] == "m/s"
     assert missing == []
 
@@ -156,7 +157,7 @@ def test_every_array_says_its_unit_and_frame(dataset: Dataset, tmp_path: Path) -
         ("split", "training", "split: expected train, val, test"),
     ],
 )
-def test_parts_that_do_not_fit_are_neither_written_nor_read(
+def test_inconsistent_parts_are_neither_written_nor_read(
     dataset: Dataset, tmp_path: Path, key: str, value: object, message: str
 ) -> None:
     path = tmp_path / "a.h5"
@@ -166,17 +167,17 @@ def test_parts_that_do_not_fit_are_neither_written_nor_read(
     assert not path.exists()
     write_dataset(path, dataset)
     with h5py.File(path, "r+") as file:
-        where = "trajectories/a/initial" if key in ("q", "v") else "trajectories/a"
+        group = "trajectories/a/initial" if key in ("q", "v") else "trajectories/a"
         if key == "split":
-            file[where].attrs[key] = value
+            file[group].attrs[key] = value
         else:
-            del file[where][key]
-            file[where][key] = value
+            del file[group][key]
+            file[group][key] = value
     with pytest.raises(InputError, match=message):
         read_dataset(path)
 
 
-KILLING = """
+KILL_WRITERS = """
 import os, random, signal, sys, time
 from dataclasses import replace
 from pathlib import Path
@@ -194,13 +195,13 @@ for _ in range(50):
 """
 
 
-def test_fifty_kills_leave_a_whole_file(dataset: Dataset, tmp_path: Path) -> None:
-    """A program that writes the file over and over is killed at any time; the file is whole every time."""
+def test_killed_writers_leave_the_file_intact(dataset: Dataset, tmp_path: Path) -> None:
+    """A process that rewrites the file repeatedly is killed at random times; the file is intact each time."""
     path = tmp_path / "a.h5"
-    big = {f"r{k}": dataset.trajectories["a"] for k in range(8)}
-    write_dataset(path, replace(dataset, trajectories=big))
-    said = subprocess.run([sys.executable, "-c", KILLING, str(path)], capture_output=True, text=True, check=True)
-    assert said.stdout.splitlines() == ["[]"] * 50
-    assert sorted(read_dataset(path).trajectories) == sorted(big)
+    trajectories = {f"r{k}": dataset.trajectories["a"] for k in range(8)}
+    write_dataset(path, replace(dataset, trajectories=trajectories))
+    result = subprocess.run([sys.executable, "-c", KILL_WRITERS, str(path)], capture_output=True, text=True, check=True)
+    assert result.stdout.splitlines() == ["[]"] * 50
+    assert sorted(read_dataset(path).trajectories) == sorted(trajectories)
     write_dataset(path, dataset)
-    assert [item.name for item in tmp_path.iterdir()] == ["a.h5"]  # what was half written is gone
+    assert [item.name for item in tmp_path.iterdir()] == ["a.h5"]  # no temporary file is left

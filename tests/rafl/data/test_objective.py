@@ -12,7 +12,7 @@ from rafl.fitting.run_folder import FittedModel
 
 
 def with_gaps(dataset: Dataset) -> Dataset:
-    """Recording a without its last 5 frames, b with a third of its markers unseen in frame 3."""
+    """Recording a without its last 5 frames, and b with a third of its markers unobserved in frame 3."""
     a, b = dataset.trajectories["a"], dataset.trajectories["b"]
     short = {key: getattr(a, key)[:-5] for key in ("time", "markers", "valid", "sigma")}
     valid = b.valid.copy()
@@ -23,7 +23,7 @@ def with_gaps(dataset: Dataset) -> Dataset:
 
 
 def test_error_of_a_known_offset(dataset: Dataset) -> None:
-    """Every marker 3 mm off: every frame's error is 3 mm, gaps and shorter recordings or not."""
+    """All markers are off by 3 mm: every frame has an error of 3 mm, also with gaps and in shorter recordings."""
     recordings = Recordings.of(with_gaps(dataset), ["a", "b"])
     simulated = recordings.markers + torch.tensor([0.0, 0.003, 0.0])
     errors = frame_errors(recordings, simulated)
@@ -33,7 +33,7 @@ def test_error_of_a_known_offset(dataset: Dataset) -> None:
 
 
 def test_loss_of_a_known_offset(dataset: Dataset) -> None:
-    """1e3 * (markers * (3 mm)^2 + 1e-4 * sum f^2) a step; the step with gaps counts its markers."""
+    """1e3 * (markers * (3 mm)^2 + 1e-4 * sum f^2) per step; only observed markers count."""
     recordings = Recordings.of(with_gaps(dataset), ["b"])
     simulated = recordings.markers + torch.tensor([0.0, 0.003, 0.0])
     nodes = dataset.simulator.mesh.vertices.shape
@@ -42,15 +42,15 @@ def test_loss_of_a_known_offset(dataset: Dataset) -> None:
     assert float(training_loss(recordings, simulated, forces, 1e-4)) == pytest.approx(expected)
 
 
-def test_tables(dataset: Dataset) -> None:
-    """+- over all (recording, frame); held-out errors are the test recordings' alone."""
+def test_error_tables(dataset: Dataset) -> None:
+    """Standard deviations are over all frames of all recordings; held-out errors are of test recordings only."""
     comparisons = compare(
         dataset, {"sysid": FittedModel("sysid", material={"youngs_modulus": 190e3, "poissons_ratio": 0.45})}
     )
     rows = error_table(comparisons)
     assert set(rows["method"]) == {"original", "sysid"}
     assert len(rows) == 8
-    # The true material simulates the recordings exactly.
+    # With the true material the simulation reproduces the recordings exactly.
     assert rows[rows["method"] == "sysid"]["mean_mm"].max() < 1e-5
     train = split_table(comparisons).query("split == 'train' and method == 'original'").iloc[0]
     pooled = np.concatenate([item.errors["original"] for item in comparisons if item.split == "train"])
@@ -61,7 +61,7 @@ def test_tables(dataset: Dataset) -> None:
     assert held_out > 0.3
 
 
-def test_transfer_counts_what_got_worse_and_latex_marks_it() -> None:
+def test_transfer_counts_datasets_with_larger_errors_and_latex_marks_the_best() -> None:
     splits = pd.DataFrame(
         [
             {"dataset": d, "split": split, "recordings": n, "method": m, "mean_mm": mean, "std_mm": 0.1}
@@ -77,7 +77,7 @@ def test_transfer_counts_what_got_worse_and_latex_marks_it() -> None:
     transfer = Transfer.of(splits)
     assert transfer.errors.loc["original"].tolist() == [1.0, 3.5]
     assert transfer.errors.loc["sysid"].tolist() == [2.0, 7.0]
-    assert transfer.negative == {"rafl": 0, "sysid": 2}
+    assert transfer.negative_transfers == {"rafl": 0, "sysid": 2}
     text = latex_table(splits)
     assert r"$\underline{\mathbf{0.500 \pm 0.100}}$" in text
     assert r"$2.000 \pm 0.100$" in text

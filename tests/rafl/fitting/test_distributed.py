@@ -1,4 +1,4 @@
-"""Two processes train as one."""
+"""Training in two processes gives the result of one process."""
 
 import os
 import subprocess
@@ -29,8 +29,8 @@ def test_torchrun_equals_one_process(dataset: Dataset, tmp_path: Path) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
     def run(*command: object) -> None:
-        done = subprocess.run([*map(str, command)], cwd=tmp_path, env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stdout + done.stderr
+        result = subprocess.run([*map(str, command)], cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert result.returncode == 0, result.stdout + result.stderr
 
     run(PROGRAM / "rafl-fit", *fit, "--out", "one")
     torchrun = [PROGRAM / "torchrun", "--standalone", "--nproc-per-node", 2, PROGRAM / "rafl-fit"]

@@ -12,17 +12,17 @@ from rafl.data.objective import Recordings
 from rafl.data.synthetic import with_material
 from rafl.evaluation.metrics import compare
 from rafl.fem.mesh import HexMesh
-from rafl.fitting import train_field as fit
+from rafl.fitting import train_field
 from rafl.fitting.methods import check_inputs
 from rafl.fitting.residual_targets import residual_targets
 from rafl.fitting.run_folder import FittedModel, Settings, load_model, load_tensors, save_model, save_tensors
 from rafl.fitting.supervised import fit_supervised
-from rafl.fitting.sysid import _Search, identify_material, spoken
+from rafl.fitting.sysid import _Search, identify_material, parameter_sentences
 from rafl.fitting.train_field import (
     fit_residual_field,
+    limit_frames,
     mean_error,
-    nothing_to_follow,
-    shortened,
+    pretraining_unavailable,
     training_items,
     validation_batches,
 )
@@ -32,7 +32,7 @@ from rafl.residual.global_residual import GlobalResidual
 SETTINGS = Settings("rafl", ("small.h5",), 3, 2e-3, 1e-5, 10, 12, 5)
 
 
-def silent(row: dict[str, float]) -> None:
+def ignore(row: dict[str, float]) -> None:
     pass
 
 
@@ -43,17 +43,17 @@ def weights(run: Path) -> list[torch.Tensor]:
 
 
 def test_training_lowers_the_error_on_held_out_recordings(dataset: Dataset, tmp_path: Path) -> None:
-    model = fit_residual_field([dataset], replace(SETTINGS, epochs=12, learning_rate=5e-3, frames=0), tmp_path, silent)
+    model = fit_residual_field([dataset], replace(SETTINGS, epochs=12, learning_rate=5e-3, frames=0), tmp_path, ignore)
     held_out = [Recordings.of(dataset, ["d"])]
     assert mean_error(held_out, model) < 0.5 * mean_error(held_out, FittedModel("original"))
 
 
-def test_a_field_has_the_symmetry_of_what_it_is_trained_on(dataset: Dataset, tmp_path: Path) -> None:
-    """A beam held at its end under gravity along z is its own mirror image across y; runs of old say nothing of it."""
+def test_new_field_has_the_symmetry_of_its_training_datasets(dataset: Dataset, tmp_path: Path) -> None:
+    """A clamped beam under gravity along z is symmetric across y. Models saved without mirrors have no symmetry."""
     settings = replace(SETTINGS, epochs=1)
-    model = fit_residual_field([dataset], settings, tmp_path / "one", silent)
-    leaning = replace(dataset, simulator=replace(dataset.simulator, gravity=(0.0, 3.0, -9.0)))
-    both = fit_residual_field([dataset, leaning], settings, tmp_path / "both", silent)
+    model = fit_residual_field([dataset], settings, tmp_path / "one", ignore)
+    inclined = replace(dataset, simulator=replace(dataset.simulator, gravity=(0.0, 3.0, -9.0)))
+    both = fit_residual_field([dataset, inclined], settings, tmp_path / "both", ignore)
     assert model.field is not None
     assert both.field is not None
     assert model.field.mirrors.tolist() == [False, True, False]
@@ -66,8 +66,8 @@ def test_a_field_has_the_symmetry_of_what_it_is_trained_on(dataset: Dataset, tmp
     assert not old.mirrors.any()
 
 
-def test_a_field_that_tears_the_body_apart_is_given_up(dataset: Dataset, tmp_path: Path) -> None:
-    """Steps far too long: training goes on from the best field with shorter ones, and says what failed."""
+def test_training_continues_from_the_best_field_after_a_failed_simulation(dataset: Dataset, tmp_path: Path) -> None:
+    """The learning rate is far too high; it is reduced, and the history counts the failures."""
     rows: list[dict[str, float]] = []
     settings = replace(SETTINGS, epochs=8, learning_rate=2.0, frames=0)
     model = fit_residual_field([dataset], settings, tmp_path, rows.append)
@@ -76,9 +76,9 @@ def test_a_field_that_tears_the_body_apart_is_given_up(dataset: Dataset, tmp_pat
     assert 1e3 * mean_error(validation_batches([dataset]), model) == min(row["validation_mm"] for row in rows)
 
 
-def test_an_interrupted_run_ends_like_an_uninterrupted_one(dataset: Dataset, tmp_path: Path) -> None:
+def test_resumed_run_equals_an_uninterrupted_one(dataset: Dataset, tmp_path: Path) -> None:
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    fit_residual_field([dataset], SETTINGS, whole, silent)
+    fit_residual_field([dataset], SETTINGS, whole, ignore)
 
     def stop_after_one(row: dict[str, float]) -> None:
         if row["epoch"] == 1:
@@ -86,27 +86,26 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(dataset: Dataset, tmp
 
     with pytest.raises(KeyboardInterrupt):
         fit_residual_field([dataset], SETTINGS, broken, stop_after_one)
-    fit_residual_field([dataset], SETTINGS, broken, silent)
+    fit_residual_field([dataset], SETTINGS, broken, ignore)
     assert (whole / "history.csv").read_text() == (broken / "history.csv").read_text()
     for one, other in zip(weights(whole), weights(broken), strict=True):
         assert torch.equal(one, other)
 
 
-def test_training_stops_when_it_no_longer_helps(
+def test_training_stops_when_the_validation_error_stalls(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     errors = iter([5.0, 4.0, 4.5, 4.4, 4.3, 4.2, 4.1])
-    monkeypatch.setattr(fit, "mean_error", lambda *_: 1e-3 * next(errors))
+    monkeypatch.setattr(train_field, "mean_error", lambda *_: 1e-3 * next(errors))
     rows: list[dict[str, float]] = []
     fit_residual_field([dataset], replace(SETTINGS, epochs=50, patience=3, frames=3), tmp_path, rows.append)
     assert [row["epoch"] for row in rows] == [0, 1, 2, 3, 4]
 
 
-def test_system_identification_explains_the_recordings(dataset: Dataset, tmp_path: Path) -> None:
-    """A hundredth of the held-out error is left. E and nu themselves trade off against one another: a bent
-    beam tells them apart poorly, so they are only near the truth."""
+def test_system_identification_reproduces_the_recordings(dataset: Dataset, tmp_path: Path) -> None:
+    """At most 1 % of the held-out error remains. E and nu are only near the truth: bending correlates them."""
     settings = replace(SETTINGS, method="sysid", epochs=40, frames=0)
-    model = identify_material([dataset], settings, tmp_path, silent)
+    model = identify_material([dataset], settings, tmp_path, ignore)
     held_out = [Recordings.of(dataset, ["d"])]
     assert mean_error(held_out, model) < 0.01 * mean_error(held_out, FittedModel("original"))
     assert model.material is not None
@@ -115,69 +114,69 @@ def test_system_identification_explains_the_recordings(dataset: Dataset, tmp_pat
     assert load_model(tmp_path).material == model.material
 
 
-def test_a_model_steps_as_it_was_fitted(dataset: Dataset, tmp_path: Path) -> None:
-    """Whatever integrator a dataset names; and what goes on from a model steps likewise."""
+def test_model_keeps_the_time_integration_of_its_fit(dataset: Dataset, tmp_path: Path) -> None:
+    """It overrides the integrator of a dataset, and a model trained from it inherits it."""
     settings = replace(SETTINGS, method="sysid", epochs=2, integrator="generalised-alpha")
-    identified = identify_material([dataset], settings, tmp_path / "a", silent)
-    assert load_model(tmp_path / "a").stepping == {"integrator": "generalised-alpha", "substeps": 1}
-    stepped = replace(dataset, simulator=replace(dataset.simulator, integrator="generalised-alpha"))
-    own, other = (mean_error([Recordings.of(each, ["d"])], identified) for each in (stepped, dataset))
+    identified = identify_material([dataset], settings, tmp_path / "a", ignore)
+    assert load_model(tmp_path / "a").time_integration == {"integrator": "generalised-alpha", "substeps": 1}
+    alpha = replace(dataset, simulator=replace(dataset.simulator, integrator="generalised-alpha"))
+    own, other = (mean_error([Recordings.of(each, ["d"])], identified) for each in (alpha, dataset))
     assert own == other
-    assert own != mean_error([Recordings.of(dataset, ["d"])], replace(identified, stepping=None))
-    errors = compare(stepped, {"sysid": identified})[-1].errors["sysid"]
+    assert own != mean_error([Recordings.of(dataset, ["d"])], replace(identified, time_integration=None))
+    errors = compare(alpha, {"sysid": identified})[-1].errors["sysid"]
     assert errors.mean() == pytest.approx(own)
     rows: list[dict[str, float]] = []
     settings = replace(SETTINGS, epochs=1, frames=0, start=str(tmp_path / "a"))
     corrected = fit_residual_field([dataset], settings, tmp_path / "b", rows.append)
-    assert corrected.stepping == identified.stepping
-    assert nothing_to_follow([dataset], replace(settings, warm_start=3))
-    assert not nothing_to_follow([dataset], replace(settings, warm_start=3, start=""))
+    assert corrected.time_integration == identified.time_integration
+    assert pretraining_unavailable([dataset], replace(settings, warm_start=3))
+    assert not pretraining_unavailable([dataset], replace(settings, warm_start=3, start=""))
     other_steps = replace(dataset, name="other", simulator=replace(dataset.simulator, substeps=2))
     check_inputs("rafl", [dataset, other_steps], tmp_path / "a", "")
     for start, integrator in ((None, ""), (tmp_path / "a", "generalised-alpha")):
         with pytest.raises(InputError, match="2 substeps"):
             check_inputs("rafl", [dataset, other_steps], start, integrator)
     untrained = 1e3 * mean_error(validation_batches([dataset]), identified)
-    assert rows[0]["validation_mm"] == pytest.approx(untrained, rel=0.05)  # the new field is nearly none
+    assert rows[0]["validation_mm"] == pytest.approx(untrained, rel=0.05)  # a new field has almost no effect
 
 
-def test_a_field_corrects_the_identified_material(dataset: Dataset, tmp_path: Path) -> None:
-    """Here the material explains all, so that a field on top of it starts where identification ended."""
-    identified = identify_material([dataset], replace(SETTINGS, method="sysid", epochs=30), tmp_path / "a", silent)
+def test_field_is_trained_on_top_of_the_identified_material(dataset: Dataset, tmp_path: Path) -> None:
+    """The material alone reproduces these recordings, so the field keeps the error of the identification."""
+    identified = identify_material([dataset], replace(SETTINGS, method="sysid", epochs=30), tmp_path / "a", ignore)
     settings = replace(SETTINGS, epochs=2, frames=0, start=str(tmp_path / "a"), warm_start=3)
-    model = fit_residual_field([dataset], settings, tmp_path / "b", silent)
+    model = fit_residual_field([dataset], settings, tmp_path / "b", ignore)
     assert model.material == identified.material
     held_out = [Recordings.of(dataset, ["d"])]
     assert mean_error(held_out, load_model(tmp_path / "b")) < 0.01 * mean_error(held_out, FittedModel("original"))
-    again = fit_residual_field([dataset], replace(settings, start=str(tmp_path / "b")), tmp_path / "c", silent)
+    again = fit_residual_field([dataset], replace(settings, start=str(tmp_path / "b")), tmp_path / "c", ignore)
     assert again.material == identified.material
 
 
-def test_fine_tuning_follows_its_recordings_first(dataset: Dataset, tmp_path: Path) -> None:
-    """All their frames, whatever of them is simulated; training begins no worse than the field came."""
-    first = fit_residual_field([dataset], replace(SETTINGS, epochs=1, frames=6), tmp_path / "a", silent)
+def test_fine_tuning_begins_with_pretraining(dataset: Dataset, tmp_path: Path) -> None:
+    """Pre-training uses all frames, even if training simulates fewer. It does not increase the validation error."""
+    first = fit_residual_field([dataset], replace(SETTINGS, epochs=1, frames=6), tmp_path / "a", ignore)
     other = with_material(dataset.simulator, 300e3, 0.3)
     changed = replace(dataset, simulator=other)
-    came = 1e3 * mean_error(validation_batches([shortened(changed, 6)]), first)
+    initial = 1e3 * mean_error(validation_batches([limit_frames(changed, 6)]), first)
     rows: list[dict[str, float]] = []
     settings = replace(SETTINGS, epochs=1, frames=6, start=str(tmp_path / "a"), warm_start=3)
     fit_residual_field([changed], settings, tmp_path / "b", rows.append)
     assert [row["warm_start"] for row in rows[:3]] == [1, 2, 3]
     assert rows[3]["epoch"] == 0
-    assert rows[3]["validation_mm"] == pytest.approx(min([came, *(row["validation_mm"] for row in rows[:3])]))
-    assert rows[3]["validation_mm"] < 0.9 * came
-    followed = torch.load(tmp_path / "b" / "targets-0.pt", weights_only=True)
+    assert rows[3]["validation_mm"] == pytest.approx(min([initial, *(row["validation_mm"] for row in rows[:3])]))
+    assert rows[3]["validation_mm"] < 0.9 * initial
+    targets = torch.load(tmp_path / "b" / "targets-0.pt", weights_only=True)
     steps = [len(dataset.trajectories[name].time) - 1 for name in dataset.split("train")]
-    assert len(followed["q"]) == sum(steps)
+    assert len(targets["q"]) == sum(steps)
 
 
-def test_an_interrupted_identification_goes_on(
+def test_interrupted_identification_is_resumed(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It ends as an uninterrupted one, and what was simulated before the end came is not simulated again."""
+    """It ends like an uninterrupted one and repeats no simulation."""
     settings = replace(SETTINGS, method="sysid", epochs=4)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    identify_material([dataset], settings, whole, silent)
+    identify_material([dataset], settings, whole, ignore)
 
     def stop(row: dict[str, float]) -> None:
         if row["epoch"] == 3:
@@ -188,16 +187,16 @@ def test_an_interrupted_identification_goes_on(
     monkeypatch.setattr(_Search, "_simulate", lambda self, x: (calls.append((self.frames, *x)), simulate(self, x))[1])
     with pytest.raises(KeyboardInterrupt):
         identify_material([dataset], settings, broken, stop)
-    identify_material([dataset], settings, broken, silent)
+    identify_material([dataset], settings, broken, ignore)
     assert len(calls) == len(set(calls))
     assert (whole / "history.csv").read_text() == (broken / "history.csv").read_text()
     assert load_model(whole).material == load_model(broken).material
 
 
-def test_the_stated_uncertainty_is_the_actual_one(dataset: Dataset, tmp_path: Path) -> None:
-    """Over noisy copies of the recordings E scatters as its interval says; E and nu trade off, and it is said."""
+def test_interval_matches_the_scatter_over_noisy_recordings(dataset: Dataset, tmp_path: Path) -> None:
+    """The standard deviation of E over noisy copies of the recordings agrees with its 95 % interval."""
     random = np.random.default_rng(3)
-    found, widths = [], []
+    estimates, sigmas = [], []
     for k in range(16):
         noisy = {
             name: replace(item, markers=item.markers + random.normal(0, 2e-4, item.markers.shape))
@@ -205,36 +204,36 @@ def test_the_stated_uncertainty_is_the_actual_one(dataset: Dataset, tmp_path: Pa
         }
         run = tmp_path / str(k)
         settings = replace(SETTINGS, method="sysid-e", epochs=4, frames=6)
-        model = identify_material([replace(dataset, trajectories=noisy)], settings, run, silent)
+        model = identify_material([replace(dataset, trajectories=noisy)], settings, run, ignore)
         assert model.material is not None
         assert model.material["poissons_ratio"] == 0.499
         table = pd.read_csv(run / "parameters.csv")
-        found.append(model.material["youngs_modulus"])
-        widths.append((table["high_95"][0] - table["low_95"][0]) / 2 / 1.96)
-    assert np.std(found, ddof=1) == pytest.approx(np.mean(widths), rel=0.5)  # of 16 copies, it varies by 18 %
+        estimates.append(model.material["youngs_modulus"])
+        sigmas.append((table["high_95"][0] - table["low_95"][0]) / 2 / 1.96)
+    # The standard deviation of 16 values has itself a relative standard deviation of 18 %.
+    assert np.std(estimates, ddof=1) == pytest.approx(np.mean(sigmas), rel=0.5)
 
 
-def test_a_fit_beside_what_cannot_be_simulated_is_kept(
+def test_fit_next_to_a_failing_material_is_kept_without_interval(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Without an interval."""
     settings = replace(SETTINGS, method="sysid-e", epochs=3, frames=4)
-    simulated = _Search._simulate
+    original = _Search._simulate
 
     def simulate(self: _Search, x: np.ndarray) -> tuple[float, list[float]]:
         if (tmp_path / "model.pt").exists():
             raise SimulationError("too stiff")
-        return simulated(self, x)
+        return original(self, x)
 
     monkeypatch.setattr(_Search, "_simulate", simulate)
-    model = identify_material([dataset], settings, tmp_path, silent)
+    model = identify_material([dataset], settings, tmp_path, ignore)
     assert load_model(tmp_path).material == model.material
-    assert "no interval" in spoken(pd.read_csv(tmp_path / "parameters.csv"))[0]
+    assert "no interval" in parameter_sentences(pd.read_csv(tmp_path / "parameters.csv"))[0]
 
 
-def test_a_material_that_explains_all_is_kept(dataset: Dataset, tmp_path: Path) -> None:
-    """Nothing to gain, and nothing to divide by."""
-    still = {
+def test_identification_with_an_initial_loss_of_zero(dataset: Dataset, tmp_path: Path) -> None:
+    """Recordings at rest without gravity: the assumed material is exact, and no division by zero occurs."""
+    at_rest = {
         name: replace(
             item, markers=np.broadcast_to(dataset.markers.rest, item.markers.shape), q=dataset.simulator.mesh.vertices
         )
@@ -242,12 +241,12 @@ def test_a_material_that_explains_all_is_kept(dataset: Dataset, tmp_path: Path) 
     }
     simulator = replace(dataset.simulator, gravity=(0.0, 0.0, 0.0))
     settings = replace(SETTINGS, method="sysid-e", epochs=1)
-    exact = replace(dataset, trajectories=still, simulator=simulator)
-    model = identify_material([exact], settings, tmp_path, silent)
+    exact = replace(dataset, trajectories=at_rest, simulator=simulator)
+    model = identify_material([exact], settings, tmp_path, ignore)
     assert mean_error(validation_batches([exact]), model) < 1e-9
 
 
-def test_trading_off_is_said() -> None:
+def test_correlated_parameters_are_reported() -> None:
     table = pd.DataFrame(
         {
             "name": ["youngs_modulus", "poissons_ratio"],
@@ -259,19 +258,19 @@ def test_trading_off_is_said() -> None:
             "correlation_poissons_ratio": [-0.97, 1.0],
         }
     )
-    first, second, third = spoken(table)
+    first, second, third = parameter_sentences(table)
     assert "1.9e+05 to 2.1e+05" in first
     assert "no interval" in second
     assert "-0.970" in third
 
 
-def test_supervised_residuals(dataset: Dataset, tmp_path: Path) -> None:
-    """The targets follow the recordings, the network learns them, and another mesh is refused by name."""
+def test_supervised_residual_network(dataset: Dataset, tmp_path: Path) -> None:
+    """Targets reproduce the recordings, the network learns them, and a mesh of another size raises an error."""
     settings = replace(SETTINGS, method="srl", epochs=75, frames=0)
     recordings = Recordings.of(dataset, ["a", "b"])
     targets = residual_targets(recordings, 1e-8)
     assert np.sqrt(targets.objective.mean() / 20) < 2e-5
-    model = fit_supervised([dataset], settings, tmp_path, silent)
+    model = fit_supervised([dataset], settings, tmp_path, ignore)
     train = [recordings]
     assert mean_error(train, model) < 0.3 * mean_error(train, FittedModel("original"))
     again = load_model(tmp_path)
@@ -286,12 +285,12 @@ def test_supervised_residuals(dataset: Dataset, tmp_path: Path) -> None:
     assert torch.equal(*forces)
     assert forces[0].abs().max() > 0
     other = replace(own, mesh=HexMesh.box((2, 1, 1), (0.02, 0.01, 0.01)))
-    with pytest.raises(InputError, match=r"srl: expected the mesh .* found 12"):
+    with pytest.raises(InputError, match=r"srl: expected the training mesh .* found 12"):
         model.residual(other)
 
 
 @pytest.mark.parametrize("method", ["rafl", "srl"])
-def test_weights_of_another_version_are_refused(method: str, dataset: Dataset, tmp_path: Path) -> None:
+def test_weights_with_other_names_are_refused(method: str, dataset: Dataset, tmp_path: Path) -> None:
     model = FittedModel("rafl", ResidualField()) if method == "rafl" else FittedModel("srl", network=GlobalResidual(8))
     save_model(tmp_path, model)
     content = load_tensors(tmp_path / "model.pt", "a model")
@@ -303,28 +302,28 @@ def test_weights_of_another_version_are_refused(method: str, dataset: Dataset, t
 
 
 @pytest.mark.parametrize("part", ["field", "optimiser", "shuffle", "history"])
-def test_a_checkpoint_with_other_contents_is_refused(part: str, dataset: Dataset, tmp_path: Path) -> None:
+def test_checkpoint_with_other_contents_is_refused(part: str, dataset: Dataset, tmp_path: Path) -> None:
     settings = Settings("rafl", ("a.h5",), 1, 1e-3, 0.0, 5, 0, 0)
-    fit_residual_field([dataset], settings, tmp_path, silent)
+    fit_residual_field([dataset], settings, tmp_path, ignore)
     content = load_tensors(tmp_path / "checkpoint.pt", "a checkpoint")
     content[part] = [{"epoch": 1.0}, 3] if part == "history" else {"unknown": torch.zeros(3)}
     save_tensors(tmp_path / "checkpoint.pt", content)
     with pytest.raises(InputError, match=r"a checkpoint of this version in .*checkpoint\.pt, found .*fit again"):
-        fit_residual_field([dataset], replace(settings, epochs=2), tmp_path, silent)
+        fit_residual_field([dataset], replace(settings, epochs=2), tmp_path, ignore)
 
 
-def test_nothing_to_train_on_is_refused(dataset: Dataset) -> None:
+def test_datasets_without_training_recordings_are_refused(dataset: Dataset) -> None:
     items = {name: replace(item, split="test") for name, item in dataset.trajectories.items()}
     with pytest.raises(InputError, match="split `train`"):
         training_items([replace(dataset, trajectories=items)])
 
 
-def test_a_strangers_pickle_is_not_run(tmp_path: Path) -> None:
-    class Trap:
+def test_code_in_a_model_file_is_not_executed(tmp_path: Path) -> None:
+    class Malicious:
         def __reduce__(self) -> tuple[object, tuple[str]]:
-            return (Path.touch, (Path(tmp_path / "sprung"),))
+            return (Path.touch, (Path(tmp_path / "executed"),))
 
-    torch.save(Trap(), tmp_path / "model.pt")
+    torch.save(Malicious(), tmp_path / "model.pt")
     with pytest.raises(InputError, match="cannot be read"):
         load_model(tmp_path)
-    assert not (tmp_path / "sprung").exists()
+    assert not (tmp_path / "executed").exists()
