@@ -1,1 +1,1 @@
-"""Specimens and recordings: from tracked markers to datasets, and from simulations to videos."""
+"""Specimens, registration, datasets and synthetic recordings."""

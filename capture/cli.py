@@ -7,15 +7,14 @@ from typing import Annotated
 
 import typer
 
-from rafl.common.command_line import command_line, user_command
+from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 
-LOADS_G = "60,90,120,70,150,100"
 SPECIMEN = "a specimen description (specimen.yaml)"
 
-render_app = command_line("Render videos of simulated specimens.")
-capture_app = command_line("Build datasets.")
+render_app = create_app("Render videos of simulated specimens.")
+capture_app = create_app("Build datasets.")
 
 
 class Background(StrEnum):
@@ -34,7 +33,7 @@ class Codec(StrEnum):
 
 
 @render_app.command()
-@user_command
+@report_errors
 def render(
     specimen: Annotated[Path, typer.Argument(help="Specimen description (specimen.yaml).")],
     out: Annotated[Path, typer.Option(help="Folder to write; new or empty.")],
@@ -71,8 +70,8 @@ def render(
     from rafl.capture import commands
 
     material = commands.TrueMaterial(youngs_modulus, poissons_ratio)
-    look = commands.appearance(dot_mm, blur_px, exposure, noise, background.value)
-    commands.render(specimen, out, loads, twists, frames, fps, material, look, codec.value, seed)
+    appearance = commands.create_appearance(dot_mm, blur_px, exposure, noise, background.value)
+    commands.render(specimen, out, loads, twists, frames, fps, material, appearance, codec.value, seed)
 
 
 def _numbers(text: str, option: str) -> list[float]:
@@ -98,7 +97,7 @@ class Forces(StrEnum):
 
 
 @capture_app.command()
-@user_command
+@report_errors
 def capture(
     specimen: Annotated[Path | None, typer.Argument(help="Specimen description (specimen.yaml).")] = None,
     tracks: Annotated[

@@ -8,13 +8,14 @@ import torch
 import typer
 from rich.console import Console
 
-from rafl.capture.dataset.build import CaptureSettings, build_dataset
-from rafl.capture.dataset.summary import print_page, recordings_table, warnings
+from rafl.capture.dataset.build import CaptureSettings as CaptureSettings
+from rafl.capture.dataset.build import build_dataset
+from rafl.capture.dataset.summary import print_contents, recordings_table, warnings
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
 from rafl.capture.registration.registration import RestPose as RestPose
-from rafl.capture.rendering.film import ENCODINGS, film, side_cameras, write_board_images, write_truth
-from rafl.capture.rendering.motion import Motion, tip_load_release, twist_release
-from rafl.capture.rendering.render import Look, Painter
+from rafl.capture.rendering.film import ENCODINGS, render_video, side_cameras, write_board_images, write_truth
+from rafl.capture.rendering.motion import SimulatedMotion, tip_load_release, twist_release
+from rafl.capture.rendering.render import Appearance, Renderer
 from rafl.capture.report import write_dataset_report
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 from rafl.common.command_line import progress
@@ -40,9 +41,9 @@ class TrueMaterial:
     poissons_ratio: float
 
 
-def appearance(dot_mm: float, blur_px: float, exposure: float, noise: float, background: str) -> Look:
-    """How frames look: dot diameter [mm], sigma of the blur [px], exposure [frame times], noise [grey levels]."""
-    return Look(0.5e-3 * dot_mm, blur_px, exposure, noise, background)
+def create_appearance(dot_mm: float, blur_px: float, exposure: float, noise: float, background: str) -> Appearance:
+    """Appearance from dot diameter [mm], sigma of the blur [px], exposure [frame times] and noise [grey levels]."""
+    return Appearance(0.5e-3 * dot_mm, blur_px, exposure, noise, background)
 
 
 def render(
@@ -53,7 +54,7 @@ def render(
     frames: int,
     fps: float,
     true: TrueMaterial,
-    look: Look,
+    appearance: Appearance,
     codec: str,
     seed: int,
 ) -> None:
@@ -68,7 +69,7 @@ def render(
     material = replace(described.material, youngs_modulus=true.youngs_modulus, poissons_ratio=true.poissons_ratio)
     with progress() as bar:
         task = bar.add_task("simulating", total=len(loads_g) + len(twists_deg))
-        motions: list[Motion] = []
+        motions: list[SimulatedMotion] = []
         try:
             for load in loads_g:
                 motions.append(tip_load_release(described, material, 1e-3 * load, frames, fps))
@@ -80,13 +81,13 @@ def render(
             raise InputError(f"the motion cannot be simulated: {error}") from None
         random = np.random.default_rng(seed)
         rig = side_cameras(described, motions, random)
-        write_board_images(out / "calibration", rig, look, random)
-        painters = {name: Painter.of(described, camera, look, random) for name, camera in rig.cameras.items()}
-        task = bar.add_task("rendering", total=frames * len(motions) * len(painters))
+        write_board_images(out / "calibration", rig, appearance, random)
+        renderers = {name: Renderer.of(described, camera, appearance, random) for name, camera in rig.cameras.items()}
+        task = bar.add_task("rendering", total=frames * len(motions) * len(renderers))
         for number, motion in enumerate(motions):
-            for view, (name, painter) in enumerate(painters.items()):
+            for view, (name, renderer) in enumerate(renderers.items()):
                 path = out / "videos" / motion.name / f"{name}.{ENCODINGS[codec].suffix}"
-                film(path, motion, painter, fps, codec, seed + 97 * number + view, lambda: bar.advance(task))
+                render_video(path, motion, renderer, fps, codec, seed + 97 * number + view, lambda: bar.advance(task))
     truth = f"E = {true.youngs_modulus} Pa, nu = {true.poissons_ratio}, density = {material.density} kg/m^3"
     write_truth(out / "truth.h5", described, motions, rig, truth)
     write_text(out / "recordings.csv", _recordings_csv(motions))
@@ -94,7 +95,7 @@ def render(
     typer.echo(f"next: rafl-calibrate {out}/calibration --out {out}/calib.yaml")
 
 
-def _recordings_csv(motions: list[Motion]) -> str:
+def _recordings_csv(motions: list[SimulatedMotion]) -> str:
     """The table of recordings: about 60 % train, the rest val and test."""
     pattern = ("train", "test", "train", "val", "train", "test")
     rows = [f"{m.name},{1e3 * m.load:g},{pattern[i % len(pattern)]}" for i, m in enumerate(motions)]
@@ -144,7 +145,7 @@ def inspect(contents: Path | None, verify: Path | None) -> None:
         InputError: a dataset cannot be read, or differs from its hashes.
     """
     if contents is not None:
-        print_page(contents, Console(width=130, soft_wrap=True))
+        print_contents(contents, Console(width=130, soft_wrap=True))
     if verify is not None:
         damaged = damaged_parts(verify)
         if damaged:

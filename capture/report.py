@@ -1,19 +1,19 @@
-"""The report of a dataset: its mesh, how recordings were registered, and their first frames, on one page."""
+"""Report of a dataset on one page: mesh, recordings, first frames and registration."""
 
 from pathlib import Path
 
 import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
+
 from rafl.capture.dataset.summary import warnings
 from rafl.capture.specimen.specimen import Specimen
-
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.evaluation.figures import bodies
+from rafl.evaluation.figures import draw_specimens
 
-MOST_PICTURES = 9  # first frames shown
-A_ROW = 3
+MAX_FRAMES_SHOWN = 9
+FRAMES_PER_ROW = 3
 
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}</title>
 <style>
@@ -27,49 +27,51 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}
 {% for line in warnings %}<p class="worse">{{ line }}</p>{% endfor %}
 <h2>The mesh</h2>
 <p>{{ mesh }}</p>
-<img alt="mesh with markers" src="data:image/png;base64,{{ picture }}">
+<img alt="mesh with markers" src="data:image/png;base64,{{ mesh_image }}">
 <h2>Recordings</h2>
-<p class="note">Registration: how far markers were from their places when brought into the specimen's frame, at worst.
-First frame: how far the fitted mesh's markers are from the recorded ones, root mean square.</p>
-<table><tr><th>recording</th><th>split</th><th>load [g]</th><th>frames</th><th>seen</th><th>begins at frame</th>
-<th>by</th><th>frames averaged</th><th>registered by</th><th>registration [mm]</th><th>first frame [mm]</th></tr>
+<p class="note">Registration: largest distance of a marker from its layout position after the transform to the specimen
+frame. First frame fit: root mean square distance between the markers of the fitted mesh and the recorded ones.</p>
+<table><tr><th>recording</th><th>split</th><th>load [g]</th><th>frames</th><th>valid</th><th>first frame</th>
+<th>found from</th><th>frames averaged</th><th>registered by</th><th>registration [mm]</th>
+<th>first frame fit [mm]</th></tr>
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 <h2>First frames</h2>
-<p class="note">Blue: the fitted mesh; red: recorded markers.
-{% if left_out %}{{ left_out }} further recordings are not shown.{% endif %}</p>
+<p class="note">Blue: fitted mesh. Red: recorded markers.
+{% if not_shown %}{{ not_shown }} more recordings are not shown.{% endif %}</p>
 {% for image in first_frames %}<img alt="first frames" src="data:image/png;base64,{{ image }}">{% endfor %}
-<h2>Residual of every marker [mm]</h2>
-<p class="note">In the first frame, by recording.</p>
+<h2>First-frame residuals of the markers [mm]</h2>
 <table><tr><th>marker</th>{% for name in names %}<th>{{ name }}</th>{% endfor %}</tr>
 {% for row in residuals %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 <h2>Registration</h2>
-<p class="note">How far from its place every marker was that shows the frame, mm; how sure the pose is.</p>
+<p class="note">Distance of each marker used from its layout position [mm]; standard deviation of the pose.</p>
 <ul>{% for line in registrations %}<li>{{ line }}</li>{% endfor %}</ul></html>
 """
 
 
 def write_dataset_report(path: Path, specimen: Specimen, dataset: Dataset) -> None:
-    """Write the report of a dataset that was just built."""
+    """Write the report of a newly built dataset."""
     plt.switch_backend("agg")
     mesh, items = dataset.simulator.mesh, dataset.trajectories
     filled = float(mesh.volumes.sum()) / specimen.volume
-    shown = [(name, item.q, item.markers[0]) for name, item in items.items()][:MOST_PICTURES]
-    off = {name: np.asarray(item.attributes["fit_markers_mm"], dtype=float) for name, item in items.items()}
+    shown = [(name, item.q, item.markers[0]) for name, item in items.items()][:MAX_FRAMES_SHOWN]
+    residuals = {name: np.asarray(item.attributes["fit_markers_mm"], dtype=float) for name, item in items.items()}
     text = (
         jinja2.Environment(autoescape=True)
         .from_string(PAGE)
         .render(
             name=dataset.name,
             warnings=warnings(dataset),
-            mesh=f"{len(mesh.vertices)} vertices, {len(mesh.hexes)} elements, {len(dataset.simulator.fixed)} vertices "
-            f"held. They fill {filled:.1%} of the shape's volume.",
-            picture=bodies(mesh, [("at rest", mesh.vertices, dataset.markers.rest)]),
+            mesh=f"{len(mesh.vertices)} vertices, {len(mesh.hexes)} elements, {len(dataset.simulator.fixed)} fixed "
+            f"vertices. The elements have {filled:.1%} of the volume of the shape.",
+            mesh_image=draw_specimens(mesh, [("at rest", mesh.vertices, dataset.markers.rest)]),
             rows=[_row(name, dataset) for name in items],
-            first_frames=[bodies(mesh, shown[k : k + A_ROW]) for k in range(0, len(shown), A_ROW)],
-            left_out=len(items) - len(shown),
+            first_frames=[
+                draw_specimens(mesh, shown[k : k + FRAMES_PER_ROW]) for k in range(0, len(shown), FRAMES_PER_ROW)
+            ],
+            not_shown=len(items) - len(shown),
             names=list(items),
             residuals=[
-                [marker, *(f"{values[k]:.3f}" if np.isfinite(values[k]) else "-" for values in off.values())]
+                [marker, *(f"{values[k]:.3f}" if np.isfinite(values[k]) else "-" for values in residuals.values())]
                 for k, marker in enumerate(dataset.markers.names)
             ],
             registrations=[_registration(name, item.attributes) for name, item in items.items()],
@@ -96,7 +98,7 @@ def _row(name: str, dataset: Dataset) -> list[object]:
 
 
 def _registration(name: str, values: dict[str, object]) -> str:
-    spread = np.sqrt(np.diag(np.asarray(values["registration_covariance"], dtype=float)))
-    turn, shift = np.degrees(np.linalg.norm(spread[:3])), 1e3 * np.linalg.norm(spread[3:])
-    sure = f"; turn +- {turn:.3f} degrees, shift +- {shift:.3f} mm" if np.isfinite(spread).all() else ""
-    return f"{name}: by {values['registration']}: {values['registration_markers'] or 'no marker needed'}{sure}"
+    sigma = np.sqrt(np.diag(np.asarray(values["registration_covariance"], dtype=float)))
+    angle, distance = np.degrees(np.linalg.norm(sigma[:3])), 1e3 * np.linalg.norm(sigma[3:])
+    accuracy = f"; rotation +- {angle:.3f} degrees, position +- {distance:.3f} mm" if np.isfinite(sigma).all() else ""
+    return f"{name}: by {values['registration']}: {values['registration_markers'] or 'no marker needed'}{accuracy}"

@@ -205,8 +205,10 @@ def simulate(
     result = {}
     for b, name in enumerate(names):
         time = dataset.trajectories[name].time
-        own = (array[: len(time), b].numpy() for array in (vertices, markers))
-        result[name] = Simulation(time, *own, dataset.markers.names)
+        frames = len(time)
+        result[name] = Simulation(
+            time, vertices[:frames, b].numpy(), markers[:frames, b].numpy(), dataset.markers.names
+        )
     return result
 
 

@@ -1,4 +1,4 @@
-"""One recording's whole way: videos to tracks."""
+"""The tracking of one recording, from its videos to its tracks."""
 
 import hashlib
 from collections.abc import Callable
@@ -8,32 +8,32 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from rafl.calibration.rig import Rig, rig_text
-from rafl.tracking.linking.follow import FEWEST_MARKERS, PixelTracks, follow
+from rafl.common.errors import InputError
+from rafl.common.files import sha256
+from rafl.common.version import VERSION
+from rafl.tracking.linking.follow import MIN_MARKERS, PixelTracks, follow
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.linking.naming import name_by_layout, name_by_rows
 from rafl.tracking.reconstruction.gap_filling import MEASURED, fill_gaps
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, at_times, shown_frames, triangulate
+from rafl.tracking.reconstruction.triangulation import CameraPixels, resample_pixels, shown_frames, triangulate
 from rafl.tracking.video.reader import Video
-from rafl.tracking.video.timestamps import camera_times, common_clock, delays
-
-from rafl.common.errors import InputError
-from rafl.common.files import sha256
-from rafl.common.version import VERSION
+from rafl.tracking.video.timestamps import camera_times, common_clock, estimate_clock_delays
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
 class TrackingSettings:
-    """How a recording is tracked.
+    """Settings for tracking a recording.
 
     Attributes:
-        layout: of the specimen's markers; None to name by row and column.
-        fps: true frames per second; None to believe the video.
-        fill: longest gap that is bridged [frames].
-        sync: whether to find the cameras' delays from the motion.
+        layout: layout of the specimen's markers; None to name the markers by row and column.
+        fps: true frame rate [1/s]; None to use the video's.
+        fill: longest gap to fill [frames].
+        sync: whether to estimate the cameras' clock offsets from the motion.
     """
 
     layout: MarkerLayout | None
@@ -42,7 +42,7 @@ class TrackingSettings:
     sync: bool = False
 
     def text(self) -> str:
-        """All of it in words, for the tracks file; equal for equal settings."""
+        """The settings as text for the tracks file. Equal settings give equal texts."""
         named = "row and column"
         if self.layout is not None:
             digest = hashlib.sha256(repr(self.layout.names).encode() + self.layout.positions.tobytes()).hexdigest()
@@ -51,8 +51,8 @@ class TrackingSettings:
         return f"fps = {self.fps or 'from the video'}; fill = {self.fill} frames; clocks {clock}; named by {named}"
 
 
-def finished(path: Path, videos: dict[str, Video], rig: Rig, settings: TrackingSettings) -> Tracks | None:
-    """The tracks at `path`, where they are whole and of just these videos, cameras and settings; else None."""
+def existing_tracks(path: Path, videos: dict[str, Video], rig: Rig, settings: TrackingSettings) -> Tracks | None:
+    """Read the tracks at `path`; None unless they are complete and made from these videos, cameras and settings."""
     if not path.is_file():
         return None
     try:
@@ -72,39 +72,41 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
 
     Args:
         videos: by camera.
-        rig: the cameras.
-        settings: how.
+        rig: the calibrated cameras.
+        settings: tracking settings.
         tick: called after every frame of every video.
 
     Raises:
-        InputError: a video without enough markers or of unknown rate, or one that cannot be decoded.
+        InputError: a video has too few markers or no known frame rate, or cannot be decoded.
     """
     for video in videos.values():
         if settings.fps is None and video.path.is_dir():
-            raise InputError(f"{video.path}: a folder of pictures has no times; give the true rate with --fps")
+            raise InputError(f"{video.path}: a folder of images has no times; give the true frame rate with --fps")
     followed = {camera: follow(video, tick) for camera, video in videos.items()}
     times = camera_times({camera: item.time for camera, item in followed.items()}, videos, settings.fps)
-    names = {camera: _names(item, videos[camera], rig, camera, settings.layout) for camera, item in followed.items()}
-    order = _all_names(names, settings.layout)
-    filmed = {camera: _in_order(item, names[camera], order) for camera, item in followed.items()}
-    ahead = {camera: rig.cameras[camera].time_offset for camera in filmed}
+    names = {
+        camera: _marker_names(item, videos[camera], rig, camera, settings.layout) for camera, item in followed.items()
+    }
+    order = _ordered_names(names, settings.layout)
+    in_order = {camera: _arrange_columns(item, names[camera], order) for camera, item in followed.items()}
+    offsets = {camera: rig.cameras[camera].time_offset for camera in in_order}
     notes = [note for item in followed.values() for note in item.notes]
-    if settings.sync and len(filmed) > 1:
-        ahead = delays(rig, filmed, times)
-        notes += [f"camera {camera}: clock {1e3 * delay:+.3f} ms by the motion" for camera, delay in ahead.items()]
-    on_rig = {camera: time - ahead[camera] for camera, time in times.items()}
-    clock = common_clock(on_rig)
-    frame = {camera: shown_frames(time, clock) for camera, time in on_rig.items()}
-    pixels = {camera: at_times(item, on_rig[camera], clock) for camera, item in filmed.items()}
+    if settings.sync and len(in_order) > 1:
+        offsets = estimate_clock_delays(rig, in_order, times)
+        notes += [f"camera {camera}: clock offset {1e3 * s:+.3f} ms, from the motion" for camera, s in offsets.items()]
+    rig_times = {camera: time - offsets[camera] for camera, time in times.items()}
+    clock = common_clock(rig_times)
+    frame = {camera: shown_frames(time, clock) for camera, time in rig_times.items()}
+    pixels = {camera: resample_pixels(item, rig_times[camera], clock) for camera, item in in_order.items()}
     position, sigma, residual = triangulate(rig, pixels)
     position, sigma, state = fill_gaps(position, sigma, clock, settings.fill)
     measured = int((state == MEASURED).any(axis=0).sum())
-    if measured < FEWEST_MARKERS:
-        raise InputError(f"expected at least {FEWEST_MARKERS} markers, tracked {measured}; check the lighting")
+    if measured < MIN_MARKERS:
+        raise InputError(f"expected at least {MIN_MARKERS} markers, tracked {measured}; check the lighting")
     for camera, item in followed.items():
-        lost = np.flatnonzero(item.damaged)
-        if len(lost):
-            notes.append(f"{videos[camera].path.name}: frames {_ranges(lost)} are damaged and count as missing")
+        damaged = np.flatnonzero(item.damaged)
+        if len(damaged):
+            notes.append(f"{videos[camera].path.name}: frames {_range_text(damaged)} are damaged and count as missing")
     return Tracks(
         names=tuple(order),
         time=clock - clock[0],
@@ -116,7 +118,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         pixel_sigma={camera: item.sigma for camera, item in pixels.items()},
         damaged={camera: item.damaged[frame[camera]] & (frame[camera] >= 0) for camera, item in followed.items()},
         frame=frame,
-        pictures={camera: item.pictures for camera, item in followed.items()},
+        images={camera: item.images for camera, item in followed.items()},
         fps=float(1.0 / np.median(np.diff(clock))),
         calibration=rig_text(rig),
         sources=_sources(videos),
@@ -125,7 +127,8 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     )
 
 
-def _in_order(item: PixelTracks, names: list[str | None], order: list[str]) -> CameraPixels:
+def _arrange_columns(item: PixelTracks, names: list[str | None], order: list[str]) -> CameraPixels:
+    """The pixels and sigmas of one camera's dots, one column per marker in the given order; NaN where not tracked."""
     pixel = np.full((len(item.time), len(order), 2), np.nan)
     sigma = np.full_like(pixel, np.nan)
     for dot, name in enumerate(names):
@@ -135,29 +138,34 @@ def _in_order(item: PixelTracks, names: list[str | None], order: list[str]) -> C
     return CameraPixels(pixel, sigma)
 
 
-def _ranges(frames: NDArray[np.int64]) -> str:
-    """Frames in words: 3, 7 to 9, 12."""
+def _range_text(frames: NDArray[np.int64]) -> str:
+    """Frame numbers as text: 3, 7 to 9, 12."""
     runs = np.split(frames, np.flatnonzero(np.diff(frames) > 1) + 1)
-    words = [str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs]
-    return ", ".join(words[:12]) + (f" and {len(words) - 12} more stretches" if len(words) > 12 else "")
+    parts = [str(run[0]) if len(run) == 1 else f"{run[0]} to {run[-1]}" for run in runs]
+    return ", ".join(parts[:12]) + (f" and {len(parts) - 12} more ranges" if len(parts) > 12 else "")
 
 
-def _names(item: PixelTracks, video: Video, rig: Rig, camera: str, layout: MarkerLayout | None) -> list[str | None]:
+def _marker_names(
+    item: PixelTracks, video: Video, rig: Rig, camera: str, layout: MarkerLayout | None
+) -> list[str | None]:
+    """The marker name of each of a camera's dots; None for a dot that is no marker of the layout."""
     if layout is not None:
-        chosen = name_by_layout(item.start, layout, rig.cameras[camera], str(video.path))
-        return [layout.names[index] if index >= 0 else None for index in chosen]
+        indices = name_by_layout(item.start, layout, rig.cameras[camera], str(video.path))
+        return [layout.names[index] if index >= 0 else None for index in indices]
     prefix = f"{camera}-" if len(rig.cameras) > 1 else ""
-    return [prefix + name for name in name_by_rows(item.start, item.late)]
+    return [prefix + name for name in name_by_rows(item.start, item.late_count)]
 
 
-def _all_names(names: dict[str, list[str | None]], layout: MarkerLayout | None) -> list[str]:
+def _ordered_names(names: dict[str, list[str | None]], layout: MarkerLayout | None) -> list[str]:
+    """The names of all tracked markers, in the layout's order, or else sorted by camera, row and column."""
     found = [name for of_camera in names.values() for name in of_camera if name]
     if layout is not None:
         return [name for name in layout.names if name in found]
-    return sorted(dict.fromkeys(found), key=lambda name: [int(p) if p.isdigit() else p for p in _parts(name)])
+    return sorted(dict.fromkeys(found), key=lambda name: [int(p) if p.isdigit() else p for p in _split_name(name)])
 
 
-def _parts(name: str) -> list[str]:
+def _split_name(name: str) -> list[str]:
+    """Prefix, row and column of a name such as left-r2c5."""
     head, _, tail = name.rpartition("r")
     row, _, column = tail.partition("c")
     return [head, row, column]

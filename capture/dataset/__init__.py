@@ -1,1 +1,1 @@
-"""Datasets built from tracks and a table of recordings."""
+"""Datasets from tracks and a table of recordings."""

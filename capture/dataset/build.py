@@ -1,4 +1,4 @@
-"""Building a dataset: recordings registered to a specimen, with their first frames fitted."""
+"""Building of datasets: registers recordings to a specimen and fits their first frames."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -8,51 +8,53 @@ from typing import Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rafl.capture.dataset.sources import Recorded, find_source, read_recorded
+
+from rafl.capture.dataset.sources import find_source, read_recording
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.initial import FirstFrame, InitialState, fit_first_frame, fit_velocity
+from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import (
     Registration,
     RestPose,
-    every_place,
+    average_frames,
+    combined_layout,
+    fit_pose_near_clamp,
     fit_rest,
-    guess_pose,
-    mean_position,
     register,
 )
 from rafl.capture.registration.release import Release, find_release
-from rafl.capture.registration.rigid import FEWEST_MARKERS
+from rafl.capture.registration.rigid import MIN_MARKERS
 from rafl.capture.registration.sequence import fit_by_sequence
 from rafl.capture.specimen.specimen import Specimen
-
 from rafl.common.errors import InputError
-from rafl.data.dataset import UNEVEN, Dataset, Trajectory
+from rafl.data.dataset import MAX_RELATIVE_TIME_ERROR, Dataset, Trajectory
 from rafl.data.synthetic import load_force
 
 Array = NDArray[Any]
 
-WINDOW = 2  # frames on each side from which the velocity in the first frame is taken, by a polynomial through all
+# Frames on each side of the first one; the polynomial through all of them gives the velocity in the first frame.
+VELOCITY_WINDOW_FRAMES = 2
 
 
 @dataclass(frozen=True)
 class CaptureSettings:
-    """How a dataset is built.
+    """Settings of `build_dataset`.
 
     Attributes:
-        tolerance: how far a marker may stand off the surface [m].
-        fit_tolerance: how far registered markers may be from the layout, root mean square [m].
-        fps: of files that do not say.
-        rest: where the specimen is undeformed, if it was recorded so.
-        moving_clamp: express markers in the frame of the clamp markers, where there are some.
-        start: first frame of all recordings whose row names none; found from the motion unless given.
-        initial: `rest`: the first frame is an equilibrium; `moving`: it has a velocity; `sequence`: as `rest`, found
+        tolerance: largest distance of a marker from the surface of the mesh [m].
+        fit_tolerance: largest root mean square residual of the registration and of the first frame [m].
+        fps: frames per second of files without a frame rate.
+        rest: frames that show the undeformed specimen, if recorded.
+        moving_clamp: express the positions in the frame of the clamp markers, if there are any.
+        start: first frame of the recordings whose row has none; None finds it from the motion.
+        initial: `rest`: the first frame is an equilibrium; `moving`: it has a velocity; `sequence`: as `rest`, fitted
             by a sequence of forces over time.
         forces: virtual forces act on the `tip` or on the whole `surface`.
     """
 
-    tolerance: float
-    fit_tolerance: float
-    fps: float
+    tolerance: float = 2e-3
+    fit_tolerance: float = 3e-3
+    fps: float = 100.0
     rest: RestPose | None = None
     moving_clamp: bool = True
     start: int | None = None
@@ -68,116 +70,124 @@ def build_dataset(
     recipe: str,
     tick: Callable[[], None],
 ) -> Dataset:
-    """Build a dataset of a specimen's recordings.
+    """Build the dataset of a specimen from its recordings.
 
     Args:
-        specimen: as described.
-        folder: of tracks, C3D or npy files named after the recordings.
+        specimen: its description.
+        folder: with tracks, C3D or npy files named after the recordings.
         rows: of recordings.csv.
-        settings: how.
-        recipe: text kept in the dataset.
+        settings: tolerances and methods.
+        recipe: text stored in the dataset.
         tick: called after every recording.
 
     Raises:
-        InputError: a file, marker or frame that does not fit; names it.
-        SimulationError: a first frame that cannot be fitted.
+        InputError: a file, marker or frame does not fit; the message names it.
+        SimulationError: a first frame cannot be fitted.
     """
     markers = specimen.markers(settings.tolerance)
 
-    def read(name: str) -> Recorded:
-        return _selected(read_recorded(find_source(folder, name), settings.fps), specimen, name)
+    def read(name: str) -> Recording:
+        return _in_layout_order(read_recording(find_source(folder, name), settings.fps), specimen, name)
 
-    recorded = {row.recording: read(row.recording) for row in rows}
+    recordings = {row.recording: read(row.recording) for row in rows}
     rest = None
     if settings.rest is not None:
         name = settings.rest.recording
-        rest = fit_rest(recorded.get(name) or read(name), settings.rest, specimen, settings.fit_tolerance)
-    step = _common_step(recorded)
-    simulator = specimen.simulator(step)
+        rest = fit_rest(recordings.get(name) or read(name), settings.rest, specimen, settings.fit_tolerance)
+    simulator = specimen.simulator(_common_time_step(recordings))
     empty = Dataset(specimen.name, simulator, markers, {}, recipe)
     trajectories = {}
     for row in rows:
-        item = recorded[row.recording]
-        registration = register(item, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
-        trajectories[row.recording] = _trajectory(empty, specimen, item, row, registration, settings)
+        recording = recordings[row.recording]
+        registration = register(recording, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
+        trajectories[row.recording] = _trajectory(empty, specimen, recording, row, registration, settings)
         tick()
     dataset = Dataset(specimen.name, simulator, markers, trajectories, recipe)
     try:
         dataset.check()
     except ValueError as error:
-        raise InputError(f"a dataset of {folder} would not be sound: {error}; correct the recording") from None
+        raise InputError(f"the dataset from {folder} would be invalid: {error}; correct the recording") from None
     return dataset
 
 
-def _common_step(recorded: dict[str, Recorded]) -> float:
-    steps = {name: float(np.median(np.diff(item.time))) for name, item in recorded.items()}
+def _common_time_step(recordings: dict[str, Recording]) -> float:
+    steps = {name: float(np.median(np.diff(recording.time))) for name, recording in recordings.items()}
     first, step = next(iter(steps.items()))
     for name, other in steps.items():
-        if abs(other / step - 1.0) > UNEVEN:
+        if abs(other / step - 1.0) > MAX_RELATIVE_TIME_ERROR:
             raise InputError(
                 f"recording {name}: expected {1 / step:.2f} frames/s as in {first}, found {1 / other:.2f}; put "
-                "recordings of different rates into different datasets"
+                "recordings with different frame rates into different datasets"
             )
     return step
 
 
-def _selected(item: Recorded, specimen: Specimen, name: str) -> Recorded:
-    """The recording with its markers in the order: the skin's, then the clamp's."""
-    wanted, _ = every_place(specimen)
-    if item.names is None:
-        if item.position.shape[1] != len(wanted):
+def _in_layout_order(recording: Recording, specimen: Specimen, name: str) -> Recording:
+    """The recording with its markers in the order of `combined_layout`."""
+    layout_names, _ = combined_layout(specimen)
+    if recording.names is None:
+        if recording.position.shape[1] != len(layout_names):
             raise InputError(
-                f"recording {name}: expected {len(wanted)} markers as in the specimen, found "
-                f"{item.position.shape[1]}; the file has no names, so its order must be the specimen's"
+                f"recording {name}: expected {len(layout_names)} markers as in the specimen, found "
+                f"{recording.position.shape[1]}; the file has no names, so its order must be that of the specimen"
             )
-        return item
-    missing = [marker for marker in wanted if marker not in item.names]
-    present = [marker for marker in specimen.layout.names if marker in item.names]
-    if len(present) < FEWEST_MARKERS:
+        return recording
+    missing = [marker for marker in layout_names if marker not in recording.names]
+    present = [marker for marker in specimen.layout.names if marker in recording.names]
+    if len(present) < MIN_MARKERS:
         raise InputError(
-            f"recording {name}: expected at least {FEWEST_MARKERS} of the specimen's markers, found "
-            f"{len(present)} (the file has {', '.join(item.names[:6])}...); name the markers alike in both"
+            f"recording {name}: expected at least {MIN_MARKERS} of the specimen's markers, found "
+            f"{len(present)} (the file has {', '.join(recording.names[:6])}...); use the same names in both"
         )
-    order = [item.names.index(marker) if marker in item.names else -1 for marker in wanted]
-    position, sigma = item.position[:, order].copy(), item.sigma[:, order].copy()
-    lost = [wanted.index(marker) for marker in missing]
-    position[:, lost] = np.nan
-    return Recorded(wanted, item.time, position, sigma, item.rest, item.in_specimen_frame, item.source)
+    order = [recording.names.index(marker) if marker in recording.names else -1 for marker in layout_names]
+    position, sigma = recording.position[:, order].copy(), recording.sigma[:, order].copy()
+    position[:, [layout_names.index(marker) for marker in missing]] = np.nan
+    return Recording(
+        layout_names,
+        recording.time,
+        position,
+        sigma,
+        recording.rest,
+        recording.in_specimen_frame,
+        recording.source,
+    )
 
 
 def _trajectory(
     dataset: Dataset,
     specimen: Specimen,
-    item: Recorded,
+    recording: Recording,
     row: RecordingRow,
     registration: Registration,
     settings: CaptureSettings,
 ) -> Trajectory:
-    """One recording on an even grid of times from its release on, its first frame fitted."""
-    skin, simulator = len(specimen.layout.names), dataset.simulator
-    position = registration.pose.apply(item.position[:, :skin])
-    sigma = registration.pose.turned_sigma(item.sigma[:, :skin])
-    position[:, [name in registration.wrong for name in specimen.layout.names]] = np.nan
-    # As recorded: where a clamp marker jumps, a still specimen only seems to move in the clamp's frame.
-    release, given = _release(item.position[:, :skin], row, settings)
-    last = len(item.time) - 1 if row.last_frame is None else row.last_frame
-    if not release.start < last < len(item.time):
+    """One recording from its release on, at even times, with its first frame fitted."""
+    own, simulator = len(specimen.layout.names), dataset.simulator
+    position = registration.pose.apply(recording.position[:, :own])
+    sigma = registration.pose.rotate_sigma(recording.sigma[:, :own])
+    position[:, [name in registration.outliers for name in specimen.layout.names]] = np.nan
+    # Positions as recorded: if a clamp marker jumps, a specimen at rest would seem to move in the frame of the clamp.
+    release, release_source = _release_and_source(recording.position[:, :own], row, settings)
+    last = len(recording.time) - 1 if row.last_frame is None else row.last_frame
+    if not release.start < last < len(recording.time):
         raise InputError(
-            f"recording {row.recording}: expected frames within 0 to {len(item.time) - 1}, found {release.start} to "
-            f"{last}; correct recordings.csv"
+            f"recording {row.recording}: expected frames within 0 to {len(recording.time) - 1}, found "
+            f"{release.start} to {last}; correct recordings.csv"
         )
     frame = _first_frame(dataset, specimen, position, sigma, release, row.recording, settings.forces == "surface")
-    initial = _fitted(frame, specimen, registration, settings)
-    position, sigma = initial.pose.apply(position), initial.pose.turned_sigma(sigma)
+    initial = _fit_initial_state(frame, specimen, registration, settings)
+    position, sigma = initial.pose.apply(position), initial.pose.rotate_sigma(sigma)
     velocity = np.zeros_like(initial.q)
     if settings.initial == "moving":
-        velocity = fit_velocity(frame, initial.q, *_marker_velocity(position, sigma, item.time, release.start))
+        velocity = fit_velocity(frame, initial.q, *_marker_velocity(position, sigma, recording.time, release.start))
     load = 1e-3 * row.load_g if row.load == "hanging" else 0.0
-    added = np.zeros(len(specimen.mesh.vertices))
-    added[specimen.loaded] = load / len(specimen.loaded)
-    time, markers, sigma = _on_grid(item, position, sigma, slice(release.start, last + 1), simulator.time_step, row)
-    pose = initial.pose if registration.guessed else registration.pose.at(slice(release.start, release.start + 1))
-    left = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - initial.pose.apply(frame.target)
+    added_mass = np.zeros(len(specimen.mesh.vertices))
+    added_mass[specimen.loaded] = load / len(specimen.loaded)
+    chosen = slice(release.start, last + 1)
+    time, markers, sigma = _on_even_grid(recording, position, sigma, chosen, simulator.time_step, row)
+    first = slice(release.start, release.start + 1)
+    pose = initial.pose if registration.pose_from_model else registration.pose.select_frames(first)
+    residual = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - initial.pose.apply(frame.target)
     return Trajectory(
         time,
         markers,
@@ -187,67 +197,75 @@ def _trajectory(
         velocity,
         initial.force,
         load_force(simulator, specimen.loaded, load),
-        added,
+        added_mass,
         row.split,
         {
             "load_g": row.load_g,
             "load": row.load,
-            "registration": registration.way,
+            "registration": registration.method,
             "registration_R": pose.rotation.reshape(-1, 3, 3)[0],
             "registration_t": pose.translation.reshape(-1, 3)[0],
             "registration_covariance": registration.covariance,
             "registration_residual_mm": 1e3 * max(registration.residual.values(), default=0.0),
             "registration_markers": ", ".join(f"{k} {1e3 * v:.3f}" for k, v in registration.residual.items()),
-            "set_aside": ", ".join(registration.wrong),
+            "set_aside": ", ".join(registration.outliers),
             "first_frame": release.start,
-            "first_frame_from": given,
-            "still_frames": release.start - release.still,
+            "first_frame_from": release_source,
+            "still_frames": release.start - release.rest_start,
             "initial": settings.initial,
             "forces": settings.forces,
             "fit_residual_mm": 1e3 * initial.residual,
-            "fit_markers_mm": 1e3 * np.linalg.norm(left, axis=1),
-            "source": item.source,
+            "fit_markers_mm": 1e3 * np.linalg.norm(residual, axis=1),
+            "source": recording.source,
         },
     )
 
 
 def _first_frame(
-    dataset: Dataset, specimen: Specimen, position: Array, sigma: Array, release: Release, name: str, everywhere: bool
+    dataset: Dataset,
+    specimen: Specimen,
+    position: Array,
+    sigma: Array,
+    release: Release,
+    name: str,
+    whole_surface: bool,
 ) -> FirstFrame:
-    """The markers where they rest before the release, or in the first frame."""
-    still = slice(release.still, max(release.start, release.still + 1))
-    target, target_sigma = mean_position(position[still], sigma[still])
-    if np.isfinite(target[:, 0]).sum() < FEWEST_MARKERS:
+    """Mean marker positions at rest before the release, or those of the first frame."""
+    rest = slice(release.rest_start, max(release.start, release.rest_start + 1))
+    target, target_sigma = average_frames(position[rest], sigma[rest])
+    if np.isfinite(target[:, 0]).sum() < MIN_MARKERS:
         raise InputError(
-            f"recording {name}, frame {release.start}: expected at least {FEWEST_MARKERS} markers, found fewer; "
+            f"recording {name}, frame {release.start}: expected at least {MIN_MARKERS} markers, found fewer; "
             "start at a later first_frame"
         )
-    skin = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
-    nodes = skin if everywhere else specimen.loaded
-    return FirstFrame(dataset.simulator, dataset.markers, nodes, target, target_sigma, name, everywhere)
+    surface = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
+    nodes = surface if whole_surface else specimen.loaded
+    return FirstFrame(dataset.simulator, dataset.markers, nodes, target, target_sigma, name, whole_surface)
 
 
-def _fitted(
+def _fit_initial_state(
     frame: FirstFrame, specimen: Specimen, registration: Registration, settings: CaptureSettings
 ) -> InitialState:
-    """The first frame, checked against the tolerance."""
+    """Fit the first frame and check its residual."""
     if settings.initial != "sequence":
-        initial = fit_first_frame(frame, guess_pose(specimen, frame.target) if registration.guessed else None)
-    elif registration.guessed:
-        raise InputError(f"recording {frame.what}: --initial sequence needs a rest pose, found none; give --rest")
+        pose = fit_pose_near_clamp(specimen, frame.target) if registration.pose_from_model else None
+        initial = fit_first_frame(frame, pose)
+    elif registration.pose_from_model:
+        raise InputError(f"recording {frame.recording}: --initial sequence needs a rest pose, found none; give --rest")
     else:
         initial = fit_by_sequence(frame)
     if initial.residual > settings.fit_tolerance:
         raise InputError(
-            f"recording {frame.what}: expected a first frame the specimen can be bent into, found its markers "
-            f"{1e3 * initial.residual:.2f} mm off (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); "
-            "check that the calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
+            f"recording {frame.recording}: expected a first frame that a deformation of the specimen explains, found "
+            f"its markers {1e3 * initial.residual:.2f} mm off (root mean square; at most "
+            f"{1e3 * settings.fit_tolerance:g} mm); check that the calibration's world is the specimen's frame, or "
+            "allow it with --fit-tolerance-mm"
         )
     return initial
 
 
-def _release(position: Array, row: RecordingRow, settings: CaptureSettings) -> tuple[Release, str]:
-    """Where the free motion begins, and who says so."""
+def _release_and_source(position: Array, row: RecordingRow, settings: CaptureSettings) -> tuple[Release, str]:
+    """Release frame, and where it comes from: the motion, the user or the beginning of the recording."""
     given = settings.start if row.first_frame is None else row.first_frame
     if given is None and settings.initial != "moving":
         return find_release(position), "the motion"
@@ -257,37 +275,38 @@ def _release(position: Array, row: RecordingRow, settings: CaptureSettings) -> t
             f"recording {row.recording}: expected a first frame within 0 to {len(position) - 1}, found {start}; "
             "correct it"
         )
-    still = start if settings.initial == "moving" else find_release(position, start).still
-    return Release(start, still), "given" if given is not None else "the beginning"
+    rest_start = start if settings.initial == "moving" else find_release(position, start).rest_start
+    return Release(start, rest_start), "given" if given is not None else "the beginning"
 
 
 def _marker_velocity(position: Array, sigma: Array, time: Array, start: int) -> tuple[Array, Array]:
-    """Velocities of the markers in a frame and their standard deviations [m/s], (M, 3), by polynomials."""
-    near = slice(max(start - WINDOW, 0), min(max(start + WINDOW, 2 * WINDOW), len(time) - 1) + 1)
-    powers = np.vander(time[near] - time[start], 2 * WINDOW + 1, increasing=True)
-    velocity, uncertain = np.full(position.shape[1:], np.nan), np.full(position.shape[1:], np.inf)
+    """Marker velocities in a frame and their standard deviations [m/s], (M, 3), by polynomials through near frames."""
+    end = min(max(start + VELOCITY_WINDOW_FRAMES, 2 * VELOCITY_WINDOW_FRAMES), len(time) - 1)
+    near = slice(max(start - VELOCITY_WINDOW_FRAMES, 0), end + 1)
+    powers = np.vander(time[near] - time[start], 2 * VELOCITY_WINDOW_FRAMES + 1, increasing=True)
+    velocity, velocity_sigma = np.full(position.shape[1:], np.nan), np.full(position.shape[1:], np.inf)
     for marker in range(position.shape[1]):
         for axis in range(3):
-            seen = np.isfinite(position[near, marker, axis])
-            if seen.sum() > 2 * WINDOW:
-                weight = 1.0 / sigma[near, marker, axis][seen]
-                inverse = np.linalg.pinv(weight[:, None] * powers[seen])
-                velocity[marker, axis] = inverse[1] @ (weight * position[near, marker, axis][seen])
-                uncertain[marker, axis] = np.linalg.norm(inverse[1])
-    return velocity, uncertain
+            measured = np.isfinite(position[near, marker, axis])
+            if measured.sum() > 2 * VELOCITY_WINDOW_FRAMES:
+                weight = 1.0 / sigma[near, marker, axis][measured]
+                inverse = np.linalg.pinv(weight[:, None] * powers[measured])
+                velocity[marker, axis] = inverse[1] @ (weight * position[near, marker, axis][measured])
+                velocity_sigma[marker, axis] = np.linalg.norm(inverse[1])
+    return velocity, velocity_sigma
 
 
-def _on_grid(
-    item: Recorded, position: Array, sigma: Array, chosen: slice, step: float, row: RecordingRow
+def _on_even_grid(
+    recording: Recording, position: Array, sigma: Array, chosen: slice, step: float, row: RecordingRow
 ) -> tuple[Array, Array, Array]:
-    """Times, markers and sigma of the chosen frames on an even grid; dropped frames are gaps."""
+    """Times, positions and sigma of the chosen frames at even times; dropped frames become gaps."""
     position, sigma = position[chosen], sigma[chosen]
-    slot = np.rint((item.time[chosen] - item.time[chosen.start]) / step).astype(int)
+    slot = np.rint((recording.time[chosen] - recording.time[chosen.start]) / step).astype(int)
     if (np.diff(slot) < 1).any():
         frame = chosen.start + int(np.argmax(np.diff(slot) < 1)) + 1
         raise InputError(
-            f"recording {row.recording}: expected even frame times, frame {frame} comes "
-            "too early; track it again with the true rate (--fps)"
+            f"recording {row.recording}: expected even frame times, found frame {frame} too early; track it again "
+            "with the true rate (--fps)"
         )
     grid = np.full((slot[-1] + 1, *position.shape[1:]), np.nan)
     grid_sigma = np.full_like(grid, np.inf)

@@ -1,53 +1,30 @@
-"""Recorded marker positions, whatever file they come in."""
+"""Readers of recorded marker positions: tracks, C3D and npy files."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import ezc3d
 import numpy as np
 from numpy.typing import NDArray
-from rafl.tracking.reconstruction.gap_filling import MISSING
-from rafl.tracking.reconstruction.tracks import read_tracks
 
+from rafl.capture.registration.recording import Recording
 from rafl.common.errors import InputError
 from rafl.common.files import sha256
+from rafl.tracking.reconstruction.gap_filling import MISSING
+from rafl.tracking.reconstruction.tracks import read_tracks
 
 Array = NDArray[Any]
 
 SUFFIXES = (".h5", ".c3d", ".npy")
-ASSUMED_SIGMA = 1e-4  # where a file has no uncertainty [m]
-LARGEST_PLAUSIBLE = 10.0  # [m]: a position beyond it is in another unit
-
-
-@dataclass(frozen=True)
-class Recorded:
-    """Marker positions of one recording, in the frame they were recorded in.
-
-    Attributes:
-        names: of the markers, (M); None where the file has none.
-        time: [s], (T).
-        position: [m], (T, M, 3), NaN where missing.
-        sigma: [m], (T, M, 3).
-        rest: positions of the undeformed specimen in the same frame [m], (M, 3), if recorded.
-        in_specimen_frame: whether a calibration has put the positions into the specimen frame.
-        source: file name and SHA-256.
-    """
-
-    names: tuple[str, ...] | None
-    time: Array
-    position: Array
-    sigma: Array
-    rest: Array | None
-    in_specimen_frame: bool
-    source: str
+ASSUMED_SIGMA = 1e-4  # of files without uncertainties [m]
+MAX_COORDINATE = 10.0  # [m]; a larger coordinate shows that the file has another unit
 
 
 def find_source(folder: Path, recording: str) -> Path:
     """The file of a recording.
 
     Raises:
-        InputError: none, or more than one.
+        InputError: no file, or more than one.
     """
     if not folder.is_dir():
         raise InputError(f"expected a folder of tracks at {folder}, found none; check the path")
@@ -63,29 +40,29 @@ def find_source(folder: Path, recording: str) -> Path:
     return found[0]
 
 
-def read_recorded(path: Path, fps: float) -> Recorded:
-    """Read a tracks file, a C3D file, or the paper authors' q<i>.npy.
+def read_recording(path: Path, fps: float) -> Recording:
+    """Read a tracks file, a C3D file, or a q<i>.npy file of the paper's authors.
 
     Args:
         path: of the file.
-        fps: frames per second of files that do not say (npy).
+        fps: frames per second of npy files, which do not store it.
 
     Raises:
-        InputError: unreadable or of another shape.
+        InputError: the file cannot be read, or has another shape.
     """
     source = f"{path.name} {sha256(path)}"
     if path.suffix == ".h5":
         tracks = read_tracks(path)
         position = np.where((tracks.state == MISSING)[..., None], np.nan, tracks.position)
-        return Recorded(tracks.names, tracks.time, position, tracks.sigma, None, True, source)
+        return Recording(tracks.names, tracks.time, position, tracks.sigma, None, True, source)
     return _read_c3d(path, source) if path.suffix == ".c3d" else _read_npy(path, fps, source)
 
 
-def _read_c3d(path: Path, source: str) -> Recorded:
+def _read_c3d(path: Path, source: str) -> Recording:
     try:
         file = ezc3d.c3d(str(path))
     except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"expected a C3D file in {path}, which cannot be read: {error}; export again") from None
+        raise InputError(f"expected a C3D file in {path}, which cannot be read: {error}; export it again") from None
     group = file["parameters"]["POINT"]
     names = tuple(str(name) for name in group["LABELS"]["value"])
     unit = str(group["UNITS"]["value"][0]).strip() if group["UNITS"]["value"] else "mm"
@@ -94,14 +71,14 @@ def _read_c3d(path: Path, source: str) -> Recorded:
         raise InputError(f"{path}: expected points in m, cm or mm, found {unit!r}; export in mm")
     points = np.asarray(file["data"]["points"], dtype=float)[:3, : len(names)].transpose(2, 1, 0) * scale
     residual = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)[0, : len(names)].T * scale
-    gone = (residual < 0) | (points == 0).all(axis=2) | ~np.isfinite(points).all(axis=2)
-    position = np.where(gone[..., None], np.nan, points)
+    missing = (residual < 0) | (points == 0).all(axis=2) | ~np.isfinite(points).all(axis=2)
+    position = np.where(missing[..., None], np.nan, points)
     sigma = np.where(residual > 0, residual, ASSUMED_SIGMA)[..., None].repeat(3, axis=2)
     rate = float(group["RATE"]["value"][0])
-    return Recorded(names, np.arange(len(points)) / rate, position, sigma, None, False, source)
+    return Recording(names, np.arange(len(points)) / rate, position, sigma, None, False, source)
 
 
-def _read_npy(path: Path, fps: float, source: str) -> Recorded:
+def _read_npy(path: Path, fps: float, source: str) -> Recording:
     try:
         content = np.load(path, allow_pickle=False)
     except (OSError, ValueError) as error:
@@ -109,11 +86,11 @@ def _read_npy(path: Path, fps: float, source: str) -> Recorded:
     if content.ndim != 3 or content.shape[2] != 3 or len(content) < 3:
         raise InputError(
             f"{path}: expected an array (1 + frames, markers, 3) in mm with the rest pose in row 0, found "
-            f"shape {content.shape}; save it so"
+            f"shape {content.shape}; save it in this shape"
         )
     position = 1e-3 * content.astype(float)
-    if np.nanmax(np.abs(position)) > LARGEST_PLAUSIBLE:
-        raise InputError(f"{path}: expected mm, found values up to {np.nanmax(np.abs(content)):g}; save in mm")
+    if np.nanmax(np.abs(position)) > MAX_COORDINATE:
+        raise InputError(f"{path}: expected mm, found values up to {np.nanmax(np.abs(content)):g}; save it in mm")
     sigma = np.full_like(position[1:], ASSUMED_SIGMA)
     time = np.arange(len(position) - 1) / fps
-    return Recorded(None, time, position[1:], sigma, position[0], False, source)
+    return Recording(None, time, position[1:], sigma, position[0], False, source)

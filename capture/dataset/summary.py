@@ -1,4 +1,4 @@
-"""What a dataset file holds, on a page of text."""
+"""Text summary of a dataset: a table of recordings, warnings, and the contents of the file."""
 
 from pathlib import Path
 
@@ -12,48 +12,47 @@ from rafl.data.dataset_file import read_dataset
 
 
 def recordings_table(dataset: Dataset) -> Table:
-    """A row a recording: split, load, where it begins, and how well markers and first frame fit."""
-    table = Table(
-        "recording", "split", "load [g]", "frames", "seen", "begins at", "registration [mm]", "first frame [mm]"
-    )
+    """Table with one row per recording: split, load, first frame, and residuals of registration and first frame."""
+    fits = ("registration [mm]", "first frame fit [mm]")
+    table = Table("recording", "split", "load [g]", "frames", "valid", "first frame", *fits)
     for name, item in dataset.trajectories.items():
         values = item.attributes
-        still = int(str(values.get("still_frames", 0)))
-        begins = f"{values.get('first_frame', '-')}" + (f" (mean of {still} before)" if still else "")
+        averaged = int(str(values.get("still_frames", 0)))
+        first_frame = f"{values.get('first_frame', '-')}" + (f" (mean of {averaged} before)" if averaged else "")
         table.add_row(
             name,
             item.split,
             f"{_number(values.get('load_g'), 'g')} {values.get('load', '')}",
             str(len(item.time)),
             f"{item.valid.mean():.1%}",
-            begins,
+            first_frame,
             _number(values.get("registration_residual_mm"), ".3f"),
             _number(values.get("fit_residual_mm"), ".3f"),
         )
     return table
 
 
-def _number(value: object, form: str) -> str:
-    return format(value, form) if isinstance(value, (int, float)) else "-"
+def _number(value: object, format_spec: str) -> str:
+    return format(value, format_spec) if isinstance(value, (int, float)) else "-"
 
 
 def warnings(dataset: Dataset) -> list[str]:
-    """What somebody should look at: markers that were set aside."""
+    """One message for each recording in which the registration left markers out."""
     lines = []
     for name, item in dataset.trajectories.items():
-        if wrong := item.attributes.get("set_aside"):
+        if outliers := item.attributes.get("set_aside"):
             lines.append(
-                f"recording {name}: {wrong} did not stand where the specimen's layout has it and was set aside; "
-                "correct at_mm, or the names in the tracks"
+                f"recording {name}: {outliers} too far from the position in the specimen's layout, left out; correct "
+                "at_mm, or the names in the tracks"
             )
     return lines
 
 
-def print_page(path: Path, console: Console) -> None:
-    """Print specimen, recordings, residuals and provenance.
+def print_contents(path: Path, console: Console) -> None:
+    """Print the specimen, recordings, residuals and provenance of a dataset file.
 
     Raises:
-        InputError: no dataset, or a damaged one.
+        InputError: the file is no dataset, or is damaged.
     """
     dataset = read_dataset(path)
     simulator, mesh = dataset.simulator, dataset.simulator.mesh
@@ -64,14 +63,14 @@ def print_page(path: Path, console: Console) -> None:
     lines = {
         "specimen": f"{dataset.name}: {len(mesh.vertices)} vertices, {len(mesh.hexes)} elements, "
         f"{size[0]:.4g} x {size[1]:.4g} x {size[2]:.4g} mm, {1e6 * mesh.volumes.sum():.4g} ml; "
-        f"{len(simulator.fixed)} vertices held",
+        f"{len(simulator.fixed)} fixed vertices",
         "material": f"{material.law}, E = {material.youngs_modulus:g} Pa, nu = {material.poissons_ratio:g}, "
         f"{material.density:g} kg/m3, {material.mass} mass",
         "time": f"{1 / simulator.time_step:g} frames/s, {simulator.integrator}, {simulator.substeps} substeps",
         "markers": f"{len(dataset.markers.names)}: {', '.join(dataset.markers.names)}",
         "splits": ", ".join(f"{split} {len(dataset.split(split))}" for split in ("train", "val", "test")),
         "units": units,
-        "made": f"{created} by {software}",
+        "created": f"{created} by {software}",
     }
     for key, text in lines.items():
         console.print(f"[bold]{key}[/bold]: {text}", highlight=False)

@@ -1,4 +1,4 @@
-"""`recordings.csv`: which recordings a dataset is made of, and how."""
+"""`recordings.csv`: the recordings of a dataset, with load, split and frames."""
 
 import csv
 import io
@@ -16,8 +16,8 @@ from rafl.common.yaml_files import StrictModel
 class RecordingRow(StrictModel):
     """A row of recordings.csv.
 
-    `load` says whether the load was cut off at the start (`released`) or hangs on during the motion
-    (`hanging`); frames count from 0 and `last_frame` is included. Without `first_frame` the motion shows it.
+    The load is either removed at the start (`released`) or stays during the motion (`hanging`). Frames count from 0,
+    `last_frame` included. Without `first_frame` the start is found from the motion.
     """
 
     recording: str = pydantic.Field(min_length=1)
@@ -29,13 +29,13 @@ class RecordingRow(StrictModel):
 
 
 def read_recording_rows(path: Path, complete: bool = True) -> list[RecordingRow]:
-    """Read recordings.csv; a `complete` one has recordings to train on.
+    """Read recordings.csv; a `complete` table must have recordings to train on.
 
-    Cells are separated by commas, semicolons or tabs, as spreadsheets of one country or another save them; where not
-    by commas, a number's comma is a decimal one.
+    Cells are separated by commas, semicolons or tabs, as spreadsheets of different countries save them. Unless commas
+    separate the cells, a comma in a number is a decimal comma.
 
     Raises:
-        InputError: missing, no table, or a row that does not fit; names the line.
+        InputError: the file is missing or no table, or a row is invalid; the message names the line.
     """
     require_file(path, "a table of recordings (recordings.csv)")
     try:
@@ -52,7 +52,7 @@ def read_recording_rows(path: Path, complete: bool = True) -> list[RecordingRow]
         if any(record.pop(None, [])):
             raise InputError(
                 f"{path} line {line}: expected {len(table.fieldnames)} cells as in the first line, found more; "
-                "put quotes around a cell that has a separator in it"
+                "put quotes around a cell that contains a separator"
             )
         cells = {key.strip(): (value or "").strip() for key, value in record.items()}
         given = {key: value for key, value in cells.items() if value}
@@ -68,9 +68,9 @@ def read_recording_rows(path: Path, complete: bool = True) -> list[RecordingRow]
             raise InputError(f"{path} line {line}, column {column}: {first['msg']}; correct it") from None
     if not rows:
         raise InputError(f"expected at least one recording in {path}, found none; add a row")
-    twice = [name for name, count in Counter(row.recording for row in rows).items() if count > 1]
-    if twice:
-        raise InputError(f"{path}: expected each recording once, {twice[0]} stands there twice; remove one row")
+    repeated = [name for name, count in Counter(row.recording for row in rows).items() if count > 1]
+    if repeated:
+        raise InputError(f"{path}: expected each recording once, found {repeated[0]} twice; remove one row")
     if complete and not any(row.split == "train" for row in rows):
         raise InputError(f"{path}: expected a recording with split `train`, found none; set one")
     return rows

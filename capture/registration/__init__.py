@@ -1,1 +1,1 @@
-"""Recordings placed on the specimen: rigid registration, release time, first frame."""
+"""Registration of recordings to the specimen: rigid transforms, the release, the first frame."""

@@ -1,4 +1,4 @@
-"""The first frame: static equilibrium under virtual forces that puts the markers where they were seen."""
+"""The first frame: a static equilibrium under virtual forces that match the markers to the recorded ones."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,38 +6,39 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rafl.capture.registration.rigid import IDENTITY, Rigid
 
+from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 from rafl.common.errors import SimulationError
 from rafl.data.markers import Markers
 from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-# Prior standard deviations of a nodal force [N]: of the part that varies linearly over the loaded
-# nodes (a pull and a moment), and of the rest, which would dent the mesh to please single markers:
-# first none of it, then little, then more where that halves what is left.
-LINEAR_SIGMA, LOCAL_SIGMAS = 1.0, (1e-5, 5e-3, 5e-2)
-SURFACE_SIGMA = 0.3  # of every force, where forces act all over the surface
-FIRST_DAMPING, LAST_DAMPING = 1e4, 1e16  # of a step, as a multiple of the prior
-MOST_STEPS = 100
-QUICK = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
-CONVERGED, ENOUGH = 1e-4, 1e-3  # the search ends where a step promises or brings less, of the objective and at all
-UNOBSERVED = 10.0  # times the median sigma: an axis that no camera saw
+# Prior standard deviations of a nodal force [N]. The linear part varies linearly over the nodes (a force and a
+# moment). The local part is the rest, which would dent the mesh to match single markers. It is fitted three times:
+# practically without it, with little of it, and with more, which is kept if it halves the remaining residual.
+LINEAR_FORCE_SIGMA, LOCAL_FORCE_SIGMAS = 1.0, (1e-5, 5e-3, 5e-2)
+SURFACE_FORCE_SIGMA = 0.3  # of the local part, if forces act on the whole surface [N]
+INITIAL_DAMPING, MAX_DAMPING = 1e4, 1e16  # of a Levenberg-Marquardt step, as a multiple of the prior
+MAX_ITERATIONS = 100
+FORCE_CHANGE_RATE = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
+# The search ends if a step promises or gives a smaller decrease: relative to the objective, plus absolute.
+RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-3
+UNOBSERVED_SIGMA_FACTOR = 10.0  # a larger multiple of the median sigma marks an axis that no camera observed
 
 
 @dataclass(frozen=True)
 class FirstFrame:
-    """What was seen of the first frame.
+    """Observation of the first frame.
 
     Attributes:
         simulator: of the specimen.
-        markers: tied to its mesh.
-        nodes: that virtual forces act on, (L).
-        target: markers [m], (M, 3), NaN where not seen.
-        sigma: their standard deviation [m], (M, 3); where the pose is sought, alike along all axes.
-        what: recording, for messages.
-        everywhere: whether the nodes are the whole surface, on each of which a force of its own may act.
+        markers: embedded in its mesh.
+        nodes: nodes on which virtual forces act, (L).
+        target: recorded marker positions [m], (M, 3), NaN where missing.
+        sigma: their standard deviations [m], (M, 3); equal along all axes if the pose is fitted too.
+        recording: name, for messages.
+        whole_surface: whether `nodes` are the whole surface, each with an independent force.
     """
 
     simulator: Simulator
@@ -45,199 +46,218 @@ class FirstFrame:
     nodes: NDArray[np.int64]
     target: Array
     sigma: Array
-    what: str
-    everywhere: bool = False
+    recording: str
+    whole_surface: bool = False
 
     @property
-    def seen(self) -> NDArray[np.bool_]:
-        """Which markers were, (M)."""
+    def measured(self) -> NDArray[np.bool_]:
+        """Which markers are not missing, (M)."""
         return np.isfinite(self.target[:, 0])
 
     @property
-    def observed(self) -> NDArray[np.bool_]:
-        """Which coordinates of the seen markers some camera saw, (M', 3)."""
-        sigma = self.sigma[self.seen]
-        return sigma < UNOBSERVED * np.median(sigma)
+    def observed_axes(self) -> NDArray[np.bool_]:
+        """Which coordinates of the M' measured markers at least one camera observed, (M', 3)."""
+        sigma = self.sigma[self.measured]
+        return np.asarray(sigma < UNOBSERVED_SIGMA_FACTOR * np.median(sigma))
 
 
 @dataclass(frozen=True)
 class InitialState:
-    """Where the mesh was in the first frame.
+    """State of the mesh in the first frame.
 
     Attributes:
-        q: [m], (N, 3).
-        force: virtual nodal forces, gravity excepted [N], (N, 3).
+        q: node positions [m], (N, 3).
+        force: virtual nodal forces, without gravity [N], (N, 3).
         residual: root mean square marker distance over the observed axes [m].
-        pose: from the frame of the target to the specimen frame; the identity where it was not sought.
+        pose: from the frame of the target to the specimen frame; the identity if it was not fitted.
     """
 
     q: Array
     force: Array
     residual: float
-    pose: Rigid
+    pose: RigidTransform
 
 
-def fit_first_frame(frame: FirstFrame, pose: Rigid | None = None) -> InitialState:
-    """Virtual forces on some nodes such that the equilibrium's markers match the first frame.
+def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> InitialState:
+    """Fit virtual forces such that the markers of the equilibrium match the first frame.
 
-    Levenberg-Marquardt on sum |x(q(f)) - target|^2 / sigma^2 + f . C^-1 f with C the prior of the forces;
-    the Jacobian through the equilibrium is the implicit-function theorem's, dx/df = dx/dq K^-1.
+    Levenberg-Marquardt minimises sum |x(q(f)) - target|^2 / sigma^2 + f . C^-1 f, where C is the prior covariance of
+    the forces. The implicit function theorem gives the Jacobian through the equilibrium, dx/df = dx/dq K^-1.
 
-    A mesh is not the specimen. At the free end first only forces that vary linearly over the nodes are sought; what
-    they leave beyond sigma is added to sigma, lest the mesh be dented to please markers that it cannot meet.
+    The mesh only approximates the specimen. If forces act on the free end, the first fit allows only forces that vary
+    linearly over the nodes. Its residual beyond sigma is added to sigma in the fits that follow, so that they do not
+    dent the mesh to match markers that it cannot match.
 
     Args:
-        frame: what was seen.
-        pose: where the specimen frame is sought too, a first guess of it.
+        frame: observation.
+        pose: initial guess of the pose, if the pose is fitted too.
 
     Raises:
         SimulationError: an equilibrium could not be found.
     """
-    posed, force = pose is not None, np.zeros_like(frame.simulator.mesh.vertices)
-    if frame.everywhere:
-        last = _Search(frame, posed, SURFACE_SIGMA, 0.0).descend(force, pose or IDENTITY, None)
+    with_pose, zero = pose is not None, np.zeros_like(frame.simulator.mesh.vertices)
+    if frame.whole_surface:
+        search = _LevenbergMarquardt(frame, with_pose, SURFACE_FORCE_SIGMA, 0.0)
+        best = search.minimise(zero, pose or IDENTITY, None)
     else:
-        none, little, more = LOCAL_SIGMAS
-        first = _Search(frame, posed, none, 0.0).descend(force, pose or IDENTITY, None)
-        own = frame.sigma[frame.seen][frame.observed]
-        beyond = np.sqrt(max(_size(frame, first.gap) ** 2 - float((own**2).mean()), 0.0))
-        last = _Search(frame, posed, little, beyond).descend(first.force, first.pose, first.q)
-        trial = _Search(frame, posed, more, beyond).descend(last.force, last.pose, last.q)
-        last = trial if _size(frame, trial.gap) < 0.5 * _size(frame, last.gap) else last
-    return InitialState(last.q, last.force, np.sqrt(3.0) * _size(frame, last.gap), last.pose)
+        least, little, more = LOCAL_FORCE_SIGMAS
+        first = _LevenbergMarquardt(frame, with_pose, least, 0.0).minimise(zero, pose or IDENTITY, None)
+        sigma = frame.sigma[frame.measured][frame.observed_axes]
+        model_sigma = np.sqrt(max(_rms(frame, first.residual) ** 2 - float((sigma**2).mean()), 0.0))
+        best = _LevenbergMarquardt(frame, with_pose, little, model_sigma).minimise(first.force, first.pose, first.q)
+        trial = _LevenbergMarquardt(frame, with_pose, more, model_sigma).minimise(best.force, best.pose, best.q)
+        best = trial if _rms(frame, trial.residual) < 0.5 * _rms(frame, best.residual) else best
+    return InitialState(best.q, best.force, np.sqrt(3.0) * _rms(frame, best.residual), best.pose)
 
 
-def _size(frame: FirstFrame, gap: Array) -> float:
-    """Root mean square of the gaps (3 M') along observed axes [m]."""
-    return float(np.sqrt((gap.reshape(-1, 3)[frame.observed] ** 2).mean()))
+def _rms(frame: FirstFrame, residual: Array) -> float:
+    """Root mean square of the residuals (3 M') along observed axes [m]."""
+    return float(np.sqrt((residual.reshape(-1, 3)[frame.observed_axes] ** 2).mean()))
 
 
 @dataclass(frozen=True)
-class _State:
-    force: Array
-    pose: Rigid
-    q: Array
-    gap: Array  # (3 M'): of the mesh's markers from the seen ones [m]
+class _Estimate:
+    force: Array  # [N], (N, 3)
+    pose: RigidTransform
+    q: Array  # [m], (N, 3)
+    residual: Array  # markers of the mesh minus measured markers in the specimen frame [m], (3 M')
     objective: float
 
 
-class _Search:
-    """One descent: with or without the pose, one prior, one size of what the mesh cannot meet."""
+class _LevenbergMarquardt:
+    """One minimisation.
 
-    def __init__(self, frame: FirstFrame, posed: bool, local: float, beyond: float) -> None:
-        self.frame, self.posed = frame, posed
-        precision = force_precision(frame.simulator.mesh.vertices[frame.nodes], local)
+    Args:
+        frame: observation.
+        with_pose: whether the pose is fitted too.
+        local_sigma: prior standard deviation of the local part of the forces [N].
+        model_sigma: standard deviation of the difference between mesh and specimen [m].
+    """
+
+    def __init__(self, frame: FirstFrame, with_pose: bool, local_sigma: float, model_sigma: float) -> None:
+        self.frame, self.with_pose = frame, with_pose
+        precision = force_precision(frame.simulator.mesh.vertices[frame.nodes], local_sigma)
         self.prior = np.kron(precision, np.eye(3))
-        self.weight = 1.0 / np.sqrt(frame.sigma[frame.seen].ravel() ** 2 + beyond**2)
+        self.weight = 1.0 / np.sqrt(frame.sigma[frame.measured].ravel() ** 2 + model_sigma**2)
 
-    def state(self, force: Array, pose: Rigid, start: Array | None) -> _State:
+    def evaluate(self, force: Array, pose: RigidTransform, start: Array | None) -> _Estimate:
+        """Equilibrium, residual and objective, with the solve started at `start` (N, 3) if given."""
         frame, simulator = self.frame, self.frame.simulator
-        total, what = (simulator.weight + force)[None], f"{frame.what}: first frame"
+        total, label = (simulator.weight + force)[None], f"{frame.recording}: first frame"
         if start is None:
-            q = simulator.equilibrium(total, what=what)[0]
-        else:  # a step too far is to fail at once, not to be led there in small ones
-            none = np.zeros(total.shape[:2])
-            q = simulator.minimise(start[None], none, start[None], total, simulator.resistance(1), what)[0]
-        own = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.seen]
-        gap = (own - pose.apply(frame.target[frame.seen])).ravel()
-        at = force[frame.nodes].ravel()
-        return _State(force, pose, q, gap, float(((self.weight * gap) ** 2).sum() + at @ self.prior @ at))
+            q = simulator.equilibrium(total, label=label)[0]
+        else:  # `minimise` fails at once where `equilibrium` would increase the load in small steps
+            zero = np.zeros(total.shape[:2])
+            q = simulator.minimise(start[None], zero, start[None], total, simulator.constitutive_state(1), label)[0]
+        positions = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.measured]
+        residual = (positions - pose.apply(frame.target[frame.measured])).ravel()
+        f = force[frame.nodes].ravel()
+        return _Estimate(force, pose, q, residual, float(((self.weight * residual) ** 2).sum() + f @ self.prior @ f))
 
-    def descend(self, force: Array, pose: Rigid, start: Array | None) -> _State:
-        """From some forces and pose to the best."""
-        now = self.state(force, pose, start)
-        damping, growth = FIRST_DAMPING, 2.0  # after H. B. Nielsen
-        for _ in range(MOST_STEPS):
-            right, normal = self._normal_equations(now)
-            if right @ np.linalg.solve(normal, right) < CONVERGED * now.objective + ENOUGH:
+    def minimise(self, force: Array, pose: RigidTransform, start: Array | None) -> _Estimate:
+        """Best estimate, from initial forces (N, 3), pose and node positions (N, 3)."""
+        current = self.evaluate(force, pose, start)
+        damping, growth = INITIAL_DAMPING, 2.0  # updated as by H. B. Nielsen
+        for _ in range(MAX_ITERATIONS):
+            gradient, hessian = self._normal_equations(current)
+            if gradient @ np.linalg.solve(hessian, gradient) < self._tolerance(current):
                 break
-            held, fall = self._held(normal), -np.inf
-            while fall <= 0.0 and damping <= LAST_DAMPING:
-                step = np.linalg.solve(normal + damping * held, -right)
+            damping_matrix, decrease = self._damping_matrix(hessian), -np.inf
+            while decrease <= 0.0 and damping <= MAX_DAMPING:
+                step = np.linalg.solve(hessian + damping * damping_matrix, -gradient)
                 try:
-                    new = self._moved(now, step)
-                except SimulationError:  # too far at once: damped more, the next trial is nearer
-                    fall = -np.inf
+                    trial = self._take_step(current, step)
+                except SimulationError:  # the step was too long; more damping shortens it
+                    decrease = -np.inf
                 else:
-                    fall = now.objective - new.objective
-                if fall > 0.0:
-                    hoped = -float(step @ (2.0 * right + normal @ step))
-                    damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * fall / hoped - 1.0) ** 3), 2.0
+                    decrease = current.objective - trial.objective
+                if decrease > 0.0:
+                    predicted = -float(step @ (2.0 * gradient + hessian @ step))
+                    damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / predicted - 1.0) ** 3), 2.0
                 else:
                     damping, growth = damping * growth, 2.0 * growth
-            if fall <= 0.0:
+            if decrease <= 0.0:
                 break
-            now = new
-            if fall < CONVERGED * now.objective + ENOUGH:
+            current = trial
+            if decrease < self._tolerance(current):
                 break
-        return now
+        return current
 
-    def _normal_equations(self, now: _State) -> tuple[Array, Array]:
-        """Half the objective's gradient by forces (3 L) and pose (6, where it is sought), and half its curvature."""
-        slopes = marker_slopes(self.frame, now.q)
-        if self.posed:
-            posed = now.pose.apply(self.frame.target[self.frame.seen])
-            slopes = np.concatenate([slopes, -_pose_slopes(posed)], axis=1)
-        slopes *= self.weight[:, None]
-        right, normal = slopes.T @ (self.weight * now.gap), slopes.T @ slopes
+    @staticmethod
+    def _tolerance(current: _Estimate) -> float:
+        return RELATIVE_TOLERANCE * current.objective + ABSOLUTE_TOLERANCE
+
+    def _normal_equations(self, current: _Estimate) -> tuple[Array, Array]:
+        """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, the pose (6)."""
+        jacobian = marker_jacobian(self.frame, current.q)
+        if self.with_pose:
+            posed = current.pose.apply(self.frame.target[self.frame.measured])
+            jacobian = np.concatenate([jacobian, -_pose_jacobian(posed)], axis=1)
+        jacobian *= self.weight[:, None]
+        gradient, hessian = jacobian.T @ (self.weight * current.residual), jacobian.T @ jacobian
         count = len(self.prior)
-        right[:count] += self.prior @ now.force[self.frame.nodes].ravel()
-        normal[:count, :count] += self.prior
-        return right, normal
+        gradient[:count] += self.prior @ current.force[self.frame.nodes].ravel()
+        hessian[:count, :count] += self.prior
+        return gradient, hessian
 
-    def _held(self, normal: Array) -> Array:
-        """What damping multiplies: the prior; of the pose, which has none, a little of its curvature."""
-        held, count = np.diag(1e-6 * np.diag(normal)), len(self.prior)
-        held[:count, :count] = self.prior
-        return held
+    def _damping_matrix(self, hessian: Array) -> Array:
+        """The prior of the forces; for the pose, which has no prior, a small multiple of its Hessian diagonal."""
+        matrix, count = np.diag(1e-6 * np.diag(hessian)), len(self.prior)
+        matrix[:count, :count] = self.prior
+        return matrix
 
-    def _moved(self, now: _State, step: Array) -> _State:
-        force, count = now.force.copy(), len(self.prior)
+    def _take_step(self, current: _Estimate, step: Array) -> _Estimate:
+        force, count = current.force.copy(), len(self.prior)
         force[self.frame.nodes] += step[:count].reshape(-1, 3)
-        return self.state(force, now.pose.moved(step[count:]) if self.posed else now.pose, now.q)
+        pose = current.pose.followed_by(step[count:]) if self.with_pose else current.pose
+        return self.evaluate(force, pose, current.q)
 
 
 def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> Array:
-    """Velocities of the mesh [m/s], (N, 3), that give the markers theirs, as changing virtual forces would.
+    """Node velocities [m/s], (N, 3), that match marker velocities, as if the virtual forces changed over time.
 
     Args:
-        frame: what was seen, and the nodes that forces act on.
+        frame: observation, and the nodes on which forces act.
         q: the mesh in the first frame [m], (N, 3).
-        velocity, sigma: of the markers and their standard deviations [m/s], (M, 3); NaN and infinite where not known.
+        velocity, sigma: of the markers and their standard deviations [m/s], (M, 3); NaN and infinite if unknown.
     """
-    slopes = marker_slopes(frame, q)
-    known = np.isfinite(velocity[frame.seen]).ravel() & np.isfinite(sigma[frame.seen]).ravel()
-    weight = 1.0 / sigma[frame.seen].ravel()[known]
-    own = weight[:, None] * slopes[known]
-    local = SURFACE_SIGMA if frame.everywhere else LOCAL_SIGMAS[1]
-    prior = np.kron(force_precision(frame.simulator.mesh.vertices[frame.nodes], local), np.eye(3)) / QUICK**2
-    right = own.T @ (weight * velocity[frame.seen].ravel()[known])
-    change = np.zeros_like(q)
-    change[frame.nodes] = np.linalg.solve(own.T @ own + prior, right).reshape(-1, 3)
-    return frame.simulator.solve_tangent(q[None], change[None])[0]
+    jacobian = marker_jacobian(frame, q)
+    known = np.isfinite(velocity[frame.measured]).ravel() & np.isfinite(sigma[frame.measured]).ravel()
+    weight = 1.0 / sigma[frame.measured].ravel()[known]
+    weighted = weight[:, None] * jacobian[known]
+    local = SURFACE_FORCE_SIGMA if frame.whole_surface else LOCAL_FORCE_SIGMAS[1]
+    precision = force_precision(frame.simulator.mesh.vertices[frame.nodes], local)
+    prior = np.kron(precision, np.eye(3)) / FORCE_CHANGE_RATE**2
+    gradient = weighted.T @ (weight * velocity[frame.measured].ravel()[known])
+    force_rate = np.zeros_like(q)
+    force_rate[frame.nodes] = np.linalg.solve(weighted.T @ weighted + prior, gradient).reshape(-1, 3)
+    return np.asarray(frame.simulator.solve_tangent(q[None], force_rate[None])[0])
 
 
-def force_precision(places: Array, local: float) -> Array:
-    """Inverse prior covariance of one component of the forces on nodes at `places` (L, 3), (L, L)."""
-    modes = np.column_stack([np.ones(len(places)), (places - places.mean(0)) / np.ptp(places, axis=0).max()])
+def force_precision(positions: Array, local_sigma: float) -> Array:
+    """Inverse prior covariance [1/N^2], (L, L), of one component of the forces on nodes at `positions` (L, 3)."""
+    extent = np.ptp(positions, axis=0).max()
+    modes = np.column_stack([np.ones(len(positions)), (positions - positions.mean(0)) / extent])
     u, s, _ = np.linalg.svd(modes, full_matrices=False)
     u = u[:, s > 1e-9 * s[0]]
     linear = u @ u.T
-    return linear / LINEAR_SIGMA**2 + (np.eye(len(places)) - linear) / local**2
+    precision: Array = linear / LINEAR_FORCE_SIGMA**2 + (np.eye(len(positions)) - linear) / local_sigma**2
+    return precision
 
 
-def marker_slopes(frame: FirstFrame, q: Array) -> Array:
-    """Derivatives of the seen markers (3 M') by the forces on the nodes (3 L) at equilibrium q [m/N]."""
-    seen = np.flatnonzero(frame.seen)
-    by_corner = frame.markers.slopes(torch.from_numpy(q)).numpy()[seen]  # (M', 3, 4, 3)
-    rows = np.zeros((len(seen), 3, *q.shape))
+def marker_jacobian(frame: FirstFrame, q: Array) -> Array:
+    """Derivatives of the measured markers by the forces on the nodes [m/N], (3 M', 3 L), at equilibrium q (N, 3)."""
+    measured = np.flatnonzero(frame.measured)
+    by_corner = frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()[measured]  # (M', 3, 4, 3)
+    rows = np.zeros((len(measured), 3, *q.shape))
     for corner in range(4):
-        rows[np.arange(len(seen)), :, frame.markers.quad[seen, corner]] += by_corner[:, :, corner]
+        rows[np.arange(len(measured)), :, frame.markers.quad[measured, corner]] += by_corner[:, :, corner]
     solved = frame.simulator.solve_tangent(q[None], np.moveaxis(rows.reshape(-1, *q.shape), 0, -1)[None])[0]
-    return np.moveaxis(solved[frame.nodes], -1, 0).reshape(3 * len(seen), -1)
+    jacobian: Array = np.moveaxis(solved[frame.nodes], -1, 0).reshape(3 * len(measured), -1)
+    return jacobian
 
 
-def _pose_slopes(points: Array) -> Array:
-    """Derivatives of posed points (3 M') by a turn (3) and a shift (3) that follow the pose."""
-    turn = np.cross(np.eye(3)[None], points[:, None]).swapaxes(1, 2)  # (M', 3, axis)
-    return np.concatenate([turn, np.broadcast_to(np.eye(3), turn.shape)], axis=2).reshape(-1, 6)
+def _pose_jacobian(points: Array) -> Array:
+    """Derivatives of posed points (M', 3) by a rotation vector and a translation after the pose, (3 M', 6)."""
+    rotation = np.cross(np.eye(3)[None], points[:, None]).swapaxes(1, 2)  # (M', 3, axis)
+    return np.concatenate([rotation, np.broadcast_to(np.eye(3), rotation.shape)], axis=2).reshape(-1, 6)

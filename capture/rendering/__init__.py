@@ -1,1 +1,1 @@
-"""Synthetic videos of simulated specimens."""
+"""Synthetic recordings: simulated motion, rendered images, encoded videos."""

@@ -1,4 +1,4 @@
-"""Filming a simulated specimen: video files, pictures of a calibration board, and the truth beside them."""
+"""Synthetic recordings on disk: videos, images of a calibration board, and the ground truth."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -14,33 +14,33 @@ import numpy as np
 import torch
 import yaml
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
 from rafl.calibration.board import FORMAT as BOARD_FORMAT
 from rafl.calibration.board import CharucoPattern
 from rafl.calibration.camera import Camera, OrthographicCamera, Plane
 from rafl.calibration.rig import PLANE_SIGMA_MM, Rig, rig_text
-from rafl.capture.rendering.motion import Motion
-from rafl.capture.rendering.render import Look, Painter, develop, drawn_dots
+from rafl.capture.rendering.motion import SimulatedMotion
+from rafl.capture.rendering.render import Appearance, Renderer, apply_camera_effects, rendered_markers
 from rafl.capture.specimen.specimen import Specimen
-from scipy.spatial.transform import Rotation
-
-from rafl.common.files import whole_file, write_text
+from rafl.common.files import atomic_file, write_text
 
 Array = NDArray[Any]
 
 IMAGE_SIZE = (1280, 720)
-MARGIN = 1.12  # picture over the space the motion sweeps
-BOARD_MM = (10.0, 7.5)  # square, marker
-BOARD_VIEWS = 12
+FIELD_OF_VIEW_FACTOR = 1.12  # field of view as a multiple of the extent that the motion sweeps
+SQUARE_MM, MARKER_MM = 10.0, 7.5  # sides on the ChArUco board
+BOARD_IMAGES = 12  # per camera
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """How a video file is written: its suffix, FFmpeg's names of muxer, encoder and pixels, and options."""
+    """Encoding of a video file: its suffix, FFmpeg's names of muxer, encoder and pixel format, encoder options."""
 
     suffix: str
     muxer: str
     encoder: str
-    pixels: str
+    pixel_format: str
     options: dict[str, str]
 
 
@@ -49,25 +49,25 @@ ENCODINGS = {
     "ffv1": Encoding("mkv", "matroska", "ffv1", "gray", {}),
     "mjpeg": Encoding("avi", "avi", "mjpeg", "yuvj420p", {"qmin": "2", "qmax": "3"}),
 }
-# Axes of each camera in the world: right, down and forward in the picture.
-VIEWS = {
+# Directions in the world of each camera: right and down in the image, and forward.
+CAMERA_AXES = {
     "left": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
     "right": ((-1.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, -1.0, 0.0)),
 }
 
 
-def side_cameras(specimen: Specimen, motions: list[Motion], random: np.random.Generator) -> Rig:
-    """One camera facing each side (y) face, a degree or so off square, framing all the motion."""
+def side_cameras(specimen: Specimen, motions: list[SimulatedMotion], random: np.random.Generator) -> Rig:
+    """Rig with one camera facing each y face, misaligned by about a degree, that sees the whole motion."""
     swept = np.concatenate([motion.q.reshape(-1, 3) for motion in motions])
     low, high = swept.min(0), swept.max(0)
-    low[0] -= 0.01  # some of the clamp
-    extent = MARGIN * (high - low)
+    low[0] -= 0.01  # shows part of the clamp
+    extent = FIELD_OF_VIEW_FACTOR * (high - low)
     scale = min(IMAGE_SIZE[0] / extent[0], IMAGE_SIZE[1] / extent[2])
     sides = (specimen.mesh.vertices[:, 1].min(), specimen.mesh.vertices[:, 1].max())
     cameras: dict[str, Camera] = {}
-    for (name, axes), side in zip(VIEWS.items(), sides, strict=True):
-        off_square = Rotation.from_rotvec(np.radians(random.normal(0.0, 0.6, 3)))
-        rotation = off_square.as_matrix() @ np.array(axes)
+    for (name, axes), side in zip(CAMERA_AXES.items(), sides, strict=True):
+        misalignment = Rotation.from_rotvec(np.radians(random.normal(0.0, 0.6, 3)))
+        rotation = misalignment.as_matrix() @ np.array(axes)
         camera = OrthographicCamera(
             image_size=IMAGE_SIZE,
             scale=(float(scale), float(0.999 * scale)),
@@ -81,88 +81,97 @@ def side_cameras(specimen: Specimen, motions: list[Motion], random: np.random.Ge
     return Rig(cameras)
 
 
-def exposure_positions(motion: Motion, frame: int, look: Look) -> Array:
-    """Mesh positions during a frame's exposure, (samples, N, 3), centred on the frame's instant."""
-    samples = look.samples if look.exposure > 0 else 1
+def exposure_positions(motion: SimulatedMotion, frame: int, appearance: Appearance) -> Array:
+    """Node positions during the exposure of a frame [m], (samples, N, 3), centred on the time of the frame."""
+    samples = appearance.samples if appearance.exposure > 0 else 1
     before = motion.q[max(frame - 1, 0)]
     after = motion.q[min(frame + 1, len(motion.q) - 1)]
-    share = look.exposure * (np.arange(samples) + 0.5) / samples - 0.5 * look.exposure
-    return motion.q[frame] + share[:, None, None] * 0.5 * (after - before)
+    time = appearance.exposure * (np.arange(samples) + 0.5) / samples - 0.5 * appearance.exposure  # [frames]
+    positions: Array = motion.q[frame] + time[:, None, None] * 0.5 * (after - before)
+    return positions
 
 
-def film(
-    path: Path, motion: Motion, painter: Painter, fps: float, codec: str, seed: int, tick: Callable[[], None]
+def render_video(
+    path: Path,
+    motion: SimulatedMotion,
+    renderer: Renderer,
+    fps: float,
+    codec: str,
+    seed: int,
+    tick: Callable[[], None],
 ) -> None:
-    """Film a motion through one camera into a video file.
+    """Render a motion through one camera into a video file.
 
     Args:
-        path: of the video, its suffix that of the encoding.
-        motion: what moves.
-        painter: what it looks like.
+        path: of the video, with the suffix of the encoding.
+        motion: to render.
+        renderer: of the camera.
         fps: frames per second.
         codec: key of `ENCODINGS`.
         seed: of the sensor noise.
         tick: called after every frame.
     """
     encoding = ENCODINGS[codec]
-    levels = "MPEG" if encoding.pixels == "yuv420p" else "JPEG"
+    levels = "MPEG" if encoding.pixel_format == "yuv420p" else "JPEG"
 
     def draw(frame: int) -> NDArray[np.uint8]:
         random = np.random.default_rng((seed, frame))
-        return painter.draw(exposure_positions(motion, frame, painter.look), random)
+        return renderer.draw(exposure_positions(motion, frame, renderer.appearance), random)
 
-    def pictures() -> Iterator[NDArray[np.uint8]]:
+    def images() -> Iterator[NDArray[np.uint8]]:
         with ThreadPoolExecutor(2) as pool:
             for start in range(0, len(motion.q), 8):
                 yield from pool.map(draw, range(start, min(start + 8, len(motion.q))))
 
-    with whole_file(path) as temporary, av.open(str(temporary), "w", format=encoding.muxer) as output:
+    with atomic_file(path) as temporary, av.open(str(temporary), "w", format=encoding.muxer) as output:
         rate = Fraction(fps).limit_denominator(10000)
         stream = output.add_stream(encoding.encoder, rate=rate)
-        stream.width, stream.height = painter.camera.image_size
-        stream.pix_fmt, stream.options = encoding.pixels, encoding.options
-        for picture in pictures():
-            frame = av.VideoFrame.from_ndarray(picture, format="gray")
-            frame = frame.reformat(format=encoding.pixels, dst_color_range=levels)
+        stream.width, stream.height = renderer.camera.image_size
+        stream.pix_fmt, stream.options = encoding.pixel_format, encoding.options
+        for image in images():
+            frame = av.VideoFrame.from_ndarray(image, format="gray")
+            frame = frame.reformat(format=encoding.pixel_format, dst_color_range=levels)
             output.mux(stream.encode(frame))
             tick()
         output.mux(stream.encode())
 
 
-def write_board_images(folder: Path, rig: Rig, look: Look, random: np.random.Generator) -> None:
-    """Pictures of a ChArUco board for every camera, with their `board.yaml`.
+def write_board_images(folder: Path, rig: Rig, appearance: Appearance, random: np.random.Generator) -> None:
+    """Write images of a ChArUco board for every camera, and `board.yaml`.
 
-    Two stand square in known places (in the camera's plane, and 20 mm nearer to it), the others are
-    tilted by 10 to 40 degrees in places nobody measured.
+    In two images of each camera the board has a known pose: aligned with the camera axes, in the plane of the camera
+    and 20 mm closer to it. In the others its pose is unknown, with a tilt of 12 to 38 degrees.
     """
     world = {}
-    origin_of_all = np.zeros(3)
-    smallest = min(float(np.linalg.norm(camera.slopes(origin_of_all)[0])) for camera in rig.cameras.values())
-    columns, rows = (int(0.92 * size / smallest / (1e-3 * BOARD_MM[0])) for size in IMAGE_SIZE)
+    world_origin = np.zeros(3)
+    pixels_per_metre = min(
+        float(np.linalg.norm(camera.projection_jacobian(world_origin)[0])) for camera in rig.cameras.values()
+    )
+    columns, rows = (int(0.92 * size / pixels_per_metre / (1e-3 * SQUARE_MM)) for size in IMAGE_SIZE)
     squares = (columns, rows)
     pattern = CharucoPattern(
         kind="charuco",
         squares=squares,
-        square_mm=BOARD_MM[0],
-        marker_mm=BOARD_MM[1],
+        square_mm=SQUARE_MM,
+        marker_mm=MARKER_MM,
         dictionary="DICT_4X4_250",
     )
     print_scale = 24  # print pixels per mm
     texture = pattern.opencv_board().generateImage(
-        (int(squares[0] * BOARD_MM[0] * print_scale), int(squares[1] * BOARD_MM[0] * print_scale)),
+        (int(squares[0] * SQUARE_MM * print_scale), int(squares[1] * SQUARE_MM * print_scale)),
         marginSize=0,
     )
-    size = 1e-3 * BOARD_MM[0] * np.asarray(squares)
+    size = 1e-3 * SQUARE_MM * np.asarray(squares)
     for name, camera in rig.cameras.items():
         assert camera.plane is not None
-        axes = np.array(VIEWS[name])
-        to_centre = (np.asarray(IMAGE_SIZE) - 1.0) / 2.0 - camera.ideal(origin_of_all)
-        middle = np.linalg.lstsq(camera.slopes(origin_of_all), to_centre, rcond=None)[0]
+        axes = np.array(CAMERA_AXES[name])
+        to_centre = (np.asarray(IMAGE_SIZE) - 1.0) / 2.0 - camera.project_undistorted(world_origin)
+        middle = np.linalg.lstsq(camera.projection_jacobian(world_origin), to_centre, rcond=None)[0]
         normal = np.array(camera.plane.normal)
         middle += (camera.plane.offset - middle @ normal) * normal
         corner = np.round(middle - axes[0] * size[0] / 2 - axes[1] * size[1] / 2, 3)
         corner += (camera.plane.offset - corner @ normal) * normal
-        for view in range(BOARD_VIEWS):
+        for view in range(BOARD_IMAGES):
             board = axes[:2].T  # board axes in the world, (3, 2)
             origin = corner
             if view < 2:
@@ -179,20 +188,18 @@ def write_board_images(folder: Path, rig: Rig, look: Look, random: np.random.Gen
                 spin = Rotation.from_rotvec(np.radians(random.normal(0, 4)) * axes[2])
                 board = (Rotation.from_rotvec(tilt * tilt_axis) * spin).as_matrix() @ board
                 origin = middle - board @ (size / 2)
-            picture = _board_picture(texture, print_scale, camera, board, origin)
+            image = _board_image(texture, print_scale, camera, board, origin)
             path = folder / name / f"{view:02d}.png"
-            with whole_file(path) as temporary:
-                cv2.imwrite(str(temporary), develop(picture, look, random))
+            with atomic_file(path) as temporary:
+                cv2.imwrite(str(temporary), apply_camera_effects(image, appearance, random))
     description = {"format": BOARD_FORMAT, "pattern": pattern.model_dump(mode="json"), "world": world}
     write_text(folder / "board.yaml", yaml.safe_dump(description, sort_keys=False, default_flow_style=None))
 
 
-def _board_picture(
-    texture: NDArray[np.uint8], print_scale: float, camera: Camera, board: Array, origin: Array
-) -> Array:
-    """The print as seen: an affine warp, drawn at twice the size and averaged down."""
-    to_pixels = camera.slopes(origin) @ board / (1e3 * print_scale)  # per print pixel
-    shift = camera.ideal(origin) + to_pixels @ [0.5, 0.5]
+def _board_image(texture: NDArray[np.uint8], print_scale: float, camera: Camera, board: Array, origin: Array) -> Array:
+    """Image of the printed board [grey levels], (H, W): an affine warp at twice the resolution, averaged down."""
+    to_pixels = camera.projection_jacobian(origin) @ board / (1e3 * print_scale)  # per print pixel
+    shift = camera.project_undistorted(origin) + to_pixels @ [0.5, 0.5]
     warp = np.column_stack([2 * to_pixels, 2 * shift + 0.5])
     width, height = camera.image_size
     large = cv2.warpAffine(
@@ -202,13 +209,14 @@ def _board_picture(
         flags=cv2.INTER_LINEAR,
         borderValue=90,
     )
-    return 30.0 + 0.75 * cv2.resize(large, (width, height), interpolation=cv2.INTER_AREA).astype(float)
+    image: Array = 30.0 + 0.75 * cv2.resize(large, (width, height), interpolation=cv2.INTER_AREA).astype(float)
+    return image
 
 
-def write_truth(path: Path, specimen: Specimen, motions: list[Motion], rig: Rig, material_text: str) -> None:
-    """`truth.h5`: per recording time, marker positions [m], their pixels by camera, and the mesh."""
-    markers = drawn_dots(specimen)
-    with whole_file(path) as temporary, h5py.File(temporary, "w") as file:
+def write_truth(path: Path, specimen: Specimen, motions: list[SimulatedMotion], rig: Rig, material_text: str) -> None:
+    """Write `truth.h5`: time, marker positions [m], their pixels by camera, and node positions of each recording."""
+    markers = rendered_markers(specimen)
+    with atomic_file(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update({"calibration": rig_text(rig), "material": material_text, "specimen": specimen.text})
         file["marker_names"] = np.array(markers.names, dtype=h5py.string_dtype())
         for motion in motions:

@@ -1,13 +1,13 @@
-"""Simulated releases of a specimen: the motion that synthetic recordings show."""
+"""Simulated releases of a specimen, for synthetic recordings."""
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rafl.capture.specimen.specimen import Specimen
 
-from rafl.data.synthetic import hung, let_go, twisted
+from rafl.capture.specimen.specimen import Specimen
+from rafl.data.synthetic import loaded_equilibria, simulate_release, twisted_shapes
 from rafl.fem.material import Material
 from rafl.simulation.simulator import Simulator
 
@@ -15,14 +15,14 @@ Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Motion:
-    """A simulated recording.
+class SimulatedMotion:
+    """Motion of one synthetic recording.
 
     Attributes:
         name: of the recording.
-        load: what hung on the tip before the release [kg].
+        load: released tip load [kg].
         time: [s], (T).
-        q: mesh positions [m], (T, N, 3); frame 0 is the moment of release.
+        q: node positions [m], (T, N, 3); frame 0 is the moment of release.
     """
 
     name: str
@@ -31,20 +31,20 @@ class Motion:
     q: Array
 
 
-def tip_load_release(specimen: Specimen, material: Material, load: float, frames: int, fps: float) -> Motion:
-    """Released from rest under a tip load [kg]."""
+def tip_load_release(specimen: Specimen, material: Material, load: float, frames: int, fps: float) -> SimulatedMotion:
+    """Motion after the release of a tip load [kg], from rest."""
     simulator = specimen.simulator(1.0 / fps, material)
-    starts = hung(simulator, specimen.loaded, np.array([load]))
-    return _motion(f"load{1e3 * load:03.0f}g", load, simulator, starts, frames)
+    starts = loaded_equilibria(simulator, specimen.loaded, np.array([load]))
+    return _simulate(f"load{1e3 * load:03.0f}g", load, simulator, starts, frames)
 
 
-def twist_release(specimen: Specimen, material: Material, angle: float, frames: int, fps: float) -> Motion:
-    """Released from a twist about the x axis, growing linearly to `angle` [rad] at the tip."""
+def twist_release(specimen: Specimen, material: Material, angle: float, frames: int, fps: float) -> SimulatedMotion:
+    """Motion after the release of a twist about the x axis, which grows linearly to `angle` [rad] at the tip."""
     simulator = specimen.simulator(1.0 / fps, material)
     name = f"twist{np.degrees(angle):03.0f}deg"
-    return _motion(name, 0.0, simulator, twisted(specimen.mesh, np.array([angle])), frames)
+    return _simulate(name, 0.0, simulator, twisted_shapes(specimen.mesh, np.array([angle])), frames)
 
 
-def _motion(name: str, load: float, simulator: Simulator, starts: Array, frames: int) -> Motion:
+def _simulate(name: str, load: float, simulator: Simulator, starts: Array, frames: int) -> SimulatedMotion:
     time = simulator.time_step * np.arange(frames)
-    return Motion(name, load, time, let_go(simulator, starts, frames, (name,))[:, 0])
+    return SimulatedMotion(name, load, time, simulate_release(simulator, starts, frames, (name,))[:, 0])

@@ -1,1 +1,1 @@
-"""The specimen: its description, shape, mesh and markers."""
+"""Specimens: description, shape, mesh and markers."""

@@ -1,4 +1,4 @@
-"""The `geometry` of a specimen file, and the hexahedra it stands for."""
+"""The `geometry` section of a specimen file, and its hexahedral mesh."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,16 +15,16 @@ from rafl.common.yaml_files import StrictModel
 from rafl.fem.mesh import HexMesh
 
 SURFACES = (".stl", ".obj", ".ply")
-MOST_CELLS = 2_000_000  # of the grid around a surface
-CHUNK = 50_000  # cell centres asked for at once
+MAX_GRID_CELLS = 2_000_000  # of the grid around a surface
+QUERY_SIZE = 50_000  # cell centres per containment query
 
 
 class Geometry(StrictModel):
-    """A box, sections, or a closed surface; exactly one of them.
+    """Exactly one of: a box, sections, or a closed surface.
 
-    `box_mm` has whole elements of `element_mm`, or `cells` along x, y and z. `rectangles` (cells wide, cells high) and
-    `ellipses` (semi-axes in cells, and how far the middle is off along y) are sections of one element each, from clamp
-    to tip. `surface` names a file in mm, beside the specimen's, whose coordinates are the specimen frame.
+    `box_mm` is divided into elements of `element_mm`, or into `cells` along x, y and z. `rectangles` (width and height
+    in cells) and `ellipses` (semi-axes, and optionally the offset of the centre along y, in cells) are sections from
+    clamp to tip, each one element long. `surface` names a file next to the specimen's, in mm and specimen coordinates.
     """
 
     element_mm: float | None = Field(default=None, gt=0)
@@ -40,9 +40,9 @@ class Geometry(StrictModel):
         if len(kinds) != 1:
             raise ValueError("expected one of box_mm, rectangles, ellipses and surface")
         if self.cells is not None and (self.box_mm is None or self.element_mm is not None or min(self.cells) < 1):
-            raise ValueError("expected cells (1 or more) with box_mm, in the place of element_mm")
+            raise ValueError("expected cells (1 or more) with box_mm, instead of element_mm")
         if self.cells is None and self.element_mm is None:
-            raise ValueError("expected element_mm, the size of an element")
+            raise ValueError("expected element_mm, the edge length of an element")
         if self.box_mm is not None and min(self.box_mm) <= 0:
             raise ValueError("expected sides longer than 0 mm")
         if self.box_mm is not None and self.element_mm is not None:
@@ -50,18 +50,18 @@ class Geometry(StrictModel):
             if np.abs(count - np.round(count)).max() > 1e-6:
                 raise ValueError(f"expected sides that are whole multiples of {self.element_mm} mm, or cells")
         if min((min(axes[:2]) for axes in [*(self.rectangles or []), *(self.ellipses or [])]), default=1) <= 0:
-            raise ValueError("expected sections wider and higher than 0")
+            raise ValueError("expected sections with a width and a height above 0")
         return self
 
-    def solid(self, folder: Path, clamp: str) -> "Solid":
-        """The hexahedra.
+    def build_solid(self, folder: Path, clamp: str) -> "Solid":
+        """Mesh the shape.
 
         Args:
             folder: of the specimen file.
-            clamp: the face that is held, `x-min` ... `z-max`; a surface's cells begin there.
+            clamp: fixed face, `x-min` ... `z-max`; the cells of a surface start there.
 
         Raises:
-            InputError: a surface that cannot be filled.
+            InputError: the surface cannot be filled.
         """
         if self.box_mm is not None:
             size = 1e-3 * np.array(self.box_mm)
@@ -69,63 +69,67 @@ class Geometry(StrictModel):
             return Solid(HexMesh.box(cells, size), float(size.prod()))
         element = 1e-3 * (self.element_mm or 1.0)
         if self.surface is not None:
-            return fill(folder / self.surface, element, clamp)
-        grid = _rectangular(self.rectangles) if self.rectangles is not None else _elliptic(self.ellipses or [])
+            return fill_surface(folder / self.surface, element, clamp)
+        grid = _rectangle_grid(self.rectangles) if self.rectangles is not None else _ellipse_grid(self.ellipses or [])
         return Solid(HexMesh.from_grid(grid, element), float(grid.sum() * element**3))
 
 
 @dataclass(frozen=True)
 class Solid:
-    """Hexahedra, and the volume of the shape they stand for [m^3]."""
+    """Hexahedral mesh, and the volume of the exact shape [m^3]."""
 
     mesh: HexMesh
     volume: float
 
 
-def _rectangular(sections: list[tuple[int, int]]) -> NDArray[np.bool_]:
-    wide, high = max(w for w, _ in sections), max(h for _, h in sections)
-    grid = np.zeros((len(sections), wide, high), dtype=bool)
+def _rectangle_grid(sections: list[tuple[int, int]]) -> NDArray[np.bool_]:
+    """Which cells of a grid (X, Y, Z) the sections fill, centred."""
+    width, height = max(w for w, _ in sections), max(h for _, h in sections)
+    grid = np.zeros((len(sections), width, height), dtype=bool)
     for x, (w, h) in enumerate(sections):
-        grid[x, (wide - w) // 2 : (wide + w) // 2, (high - h) // 2 : (high + h) // 2] = True
+        grid[x, (width - w) // 2 : (width + w) // 2, (height - h) // 2 : (height + h) // 2] = True
     return grid
 
 
-def _elliptic(sections: list[tuple[float, float] | tuple[float, float, float]]) -> NDArray[np.bool_]:
-    wide, high = (int(max(axes[k] for axes in sections)) for k in (0, 1))
-    y, z = np.arange(-wide, wide + 1)[:, None], np.arange(-high, high + 1)
-    middle = [axes[2] if len(axes) == 3 else 0.0 for axes in sections]
+def _ellipse_grid(sections: list[tuple[float, float] | tuple[float, float, float]]) -> NDArray[np.bool_]:
+    """Which cells of a grid (X, Y, Z) have their centres inside the sections."""
+    half_width, half_height = (int(max(axes[k] for axes in sections)) for k in (0, 1))
+    y, z = np.arange(-half_width, half_width + 1)[:, None], np.arange(-half_height, half_height + 1)
+    centre = [axes[2] if len(axes) == 3 else 0.0 for axes in sections]
     return np.array(
-        [((y - m) / axes[0]) ** 2 + (z / axes[1]) ** 2 <= 1.0 for m, axes in zip(middle, sections, strict=True)]
+        [((y - c) / axes[0]) ** 2 + (z / axes[1]) ** 2 <= 1.0 for c, axes in zip(centre, sections, strict=True)]
     )
 
 
-def fill(path: Path, element: float, clamp: str) -> Solid:
-    """The cells of a grid whose centres lie inside a closed surface.
+def fill_surface(path: Path, element: float, clamp: str) -> Solid:
+    """Mesh a closed surface with the cells of a grid whose centres lie inside.
 
-    The grid begins at the clamped face and stands centred across, so that a symmetric surface gives symmetric cells.
+    The grid starts at the fixed face and is centred along the other axes, so that a symmetric surface gives a
+    symmetric mesh.
 
     Args:
         path: of an STL, OBJ or PLY file in mm.
-        element: edge of a cell [m].
-        clamp: the face that is held, `x-min` ... `z-max`.
+        element: edge length of a cell [m].
+        clamp: fixed face, `x-min` ... `z-max`.
 
     Raises:
-        InputError: no such file, not a surface, open, too coarse or too fine cells, cells that do not hang together.
+        InputError: no such file, no closed surface, cells too coarse or too fine, or a mesh in several pieces.
     """
     surface = read_surface(path)
     low, high = 1e-3 * surface.bounds
     count = np.maximum(np.ceil((high - low) / element - 1e-6), 1.0).astype(int)
-    if count.prod() > MOST_CELLS:
+    if count.prod() > MAX_GRID_CELLS:
         raise InputError(
-            f"surface {path}: expected at most {MOST_CELLS} elements around it, found {count.prod()} of "
+            f"surface {path}: expected at most {MAX_GRID_CELLS} elements around it, found {count.prod()} of "
             f"{1e3 * element:g} mm in {' x '.join(f'{x:.4g}' for x in 1e3 * (high - low))} mm; is the file in mm?"
         )
-    begin = 0.5 * (low + high) - 0.5 * element * count
+    origin = 0.5 * (low + high) - 0.5 * element * count
     axis = "xyz".index(clamp[0])
-    begin[axis] = low[axis] if clamp.endswith("min") else high[axis] - element * count[axis]
-    places = begin + element * (np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1) + 0.5)
+    origin[axis] = low[axis] if clamp.endswith("min") else high[axis] - element * count[axis]
+    centres = origin + element * (np.stack(np.meshgrid(*map(np.arange, count), indexing="ij"), axis=-1) + 0.5)
+    parts = -(-count.prod() // QUERY_SIZE)
     inside = np.concatenate(
-        [surface.contains(1e3 * part) for part in np.array_split(places.reshape(-1, 3), -(-count.prod() // CHUNK))]
+        [surface.contains(1e3 * part) for part in np.array_split(centres.reshape(-1, 3), parts)]
     ).reshape(count)
     if not inside.any():
         raise InputError(
@@ -139,14 +143,14 @@ def fill(path: Path, element: float, clamp: str) -> Solid:
             "choose a smaller element_mm"
         )
     mesh = HexMesh.from_grid(inside, element)
-    return Solid(HexMesh(mesh.vertices + begin, mesh.hexes), 1e-9 * float(surface.volume))
+    return Solid(HexMesh(mesh.vertices + origin, mesh.hexes), 1e-9 * float(surface.volume))
 
 
 def read_surface(path: Path) -> trimesh.Trimesh:
-    """A closed surface, its normals outwards [mm].
+    """Read a closed surface [mm] and turn its normals outwards.
 
     Raises:
-        InputError: no such file, not a surface, or open.
+        InputError: no such file, no surface, or not closed.
     """
     require_file(path, "a surface (.stl, .obj or .ply)")
     if path.suffix.lower() not in SURFACES:
@@ -161,10 +165,11 @@ def read_surface(path: Path) -> trimesh.Trimesh:
     if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise InputError(f"expected triangles in {path}, found none; export it again as a mesh")
     if not surface.is_watertight:
-        _, sharing = np.unique(np.sort(surface.edges, axis=1), axis=0, return_counts=True)
+        _, triangles = np.unique(np.sort(surface.edges, axis=1), axis=0, return_counts=True)
+        open_edges = int((triangles != 2).sum())
         raise InputError(
-            f"surface {path}: expected it closed (watertight), found {int((sharing != 2).sum())} of {len(sharing)} "
-            "edges that do not join two triangles; close its holes and export it again"
+            f"surface {path}: expected a closed surface (watertight), found {open_edges} of {len(triangles)} edges "
+            "that do not join two triangles; close its holes and export it again"
         )
     if not surface.is_winding_consistent:
         surface.fix_normals()

@@ -1,4 +1,4 @@
-"""`specimen.yaml`: what a specimen is, and the simulator it is given."""
+"""Specimens as described in `specimen.yaml`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -6,15 +6,15 @@ from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
-from rafl.capture.specimen.geometry import Geometry
-from rafl.tracking.linking.layout import SPECIMEN_FORMAT, MarkerLayout, MarkerList
 
+from rafl.capture.specimen.geometry import Geometry
 from rafl.common.errors import InputError
 from rafl.common.yaml_files import StrictModel, read_yaml
 from rafl.data.markers import Markers, embed, embedding_gap
 from rafl.fem.material import PRESETS, Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.simulator import Simulator
+from rafl.tracking.linking.layout import SPECIMEN_FORMAT, MarkerLayout, MarkerList
 
 DEFAULT_PRESET: Literal["paper", "physical"] = "physical"
 Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
@@ -64,19 +64,19 @@ class _SpecimenFile(StrictModel):
 
 @dataclass(frozen=True)
 class Specimen:
-    """A specimen as described.
+    """A specimen.
 
     Attributes:
         name: of the specimen.
-        mesh: at rest, specimen frame.
-        material: assumed.
+        mesh: at rest, in the specimen frame.
+        material: assumed material.
         fixed: clamped nodes, (F).
-        loaded: nodes a load hangs on, (L).
-        layout: of the markers on the skin.
+        loaded: nodes that carry a load, (L).
+        layout: of the markers on the specimen.
         clamp_layout: of the markers on the clamp; may be empty.
         text: of the file.
-        integrator, substeps: how its simulator steps in time.
-        volume: of the shape that the mesh stands for [m^3].
+        integrator, substeps: time integration of its simulator.
+        volume: of the exact shape [m^3].
     """
 
     name: str
@@ -92,7 +92,7 @@ class Specimen:
     volume: float
 
     def simulator(self, time_step: float, material: Material | None = None) -> Simulator:
-        """A simulator of this specimen, of its assumed material unless another is given."""
+        """Simulator with a time step [s]; with the assumed material unless another is given."""
         return Simulator(
             self.mesh,
             material or self.material,
@@ -103,31 +103,36 @@ class Specimen:
         )
 
     def markers(self, tolerance: float, advice: str = "or allow it with --tolerance-mm") -> Markers:
-        """The markers tied to the mesh; `advice` ends the message where one cannot be.
+        """The markers, embedded in the mesh.
+
+        Args:
+            tolerance: largest distance of a marker from the surface of the mesh [m].
+            advice: end of the error message.
 
         Raises:
-            InputError: a marker stands further than `tolerance` [m] off the surface.
+            InputError: a marker is farther than `tolerance` from the surface.
         """
         markers = embed(self.mesh, self.layout.names, self.layout.positions)
-        off = np.maximum(np.abs(markers.normal_offset), embedding_gap(self.mesh, markers))
-        if (off > tolerance).any():
-            worst = int(np.argmax(off))
+        distance = np.maximum(np.abs(markers.normal_offset), embedding_gap(self.mesh, markers))
+        if (distance > tolerance).any():
+            worst = int(np.argmax(distance))
             raise InputError(
                 f"specimen {self.name}: marker {markers.names[worst]} at "
-                f"{np.round(1e3 * markers.rest[worst], 3).tolist()} mm lies {1e3 * off[worst]:.2f} mm off "
+                f"{np.round(1e3 * markers.rest[worst], 3).tolist()} mm lies {1e3 * distance[worst]:.2f} mm off "
                 f"the surface, expected at most {1e3 * tolerance:g} mm; correct at_mm, {advice}"
             )
         return markers
 
 
-def read_specimen(path: Path) -> Specimen:
+def read_specimen(path: str | Path) -> Specimen:
     """Read `specimen.yaml`.
 
     Raises:
-        InputError: missing, damaged, of a newer version, or a shape that cannot be meshed.
+        InputError: the file is missing, damaged or of a newer version, or the shape cannot be meshed.
     """
+    path = Path(path)
     content = read_yaml(path, _SpecimenFile, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
-    solid = content.geometry.solid(path.parent, content.clamp.face)
+    solid = content.geometry.build_solid(path.parent, content.clamp.face)
     mesh = solid.mesh
     return Specimen(
         content.name,

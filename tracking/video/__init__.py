@@ -1,1 +1,1 @@
-"""Videos read frame by frame: decoding, timestamps, damage and compression."""
+"""Read videos frame by frame: decoding, timestamps, damage and compression."""

@@ -1,4 +1,4 @@
-"""Frames out of a video file, decoded packet by packet; what is damaged is left out."""
+"""Decode a video file packet by packet, without the damaged frames."""
 
 import os
 import queue
@@ -8,93 +8,108 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing
 from itertools import islice, starmap
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 from numpy.typing import NDArray
-from rafl.tracking.video.ffmpeg import FFmpegDecoder, Outcome, luma_size, opened, packets_of
-from rafl.tracking.video.frame import Frame
-from rafl.tracking.video.frame_order import Order, Piece
-from rafl.tracking.video.hevc import HevcDecoder
-from rafl.tracking.video.jpeg import JpegDecoder
-from rafl.tracking.video.nal_units import Renewals, Units
-from rafl.tracking.video.prefetch import ahead
 
 from rafl.common.errors import InputError
+from rafl.tracking.video.ffmpeg import DecodingResult, FFmpegDecoder, luma_bytes, open_container, read_packets
+from rafl.tracking.video.frame import Frame
+from rafl.tracking.video.frame_order import DecodedPacket, FrameOrder
+from rafl.tracking.video.hevc import HevcDecoder
+from rafl.tracking.video.jpeg import JpegDecoder
+from rafl.tracking.video.nal_units import NalUnits, RandomAccessPoints
+from rafl.tracking.video.prefetch import prefetch
 
-Decoder = Callable[[list["av.packet.Packet"]], list[Outcome]]
+Array = NDArray[Any]
+Decoder = Callable[[list["av.packet.Packet"]], list[DecodingResult]]
 
-TOGETHER = 4  # packets
-# Decoders side by side, of videos each of whose pictures stands for itself: one more for so many bytes a picture, which
-# take about as long as following the dots in it. More than it needs would only keep the follower from its work.
-MOST_DECODERS, BYTES_EACH = 4, 40_000
+PACKETS_PER_TASK = 4
+# Intra-only videos, in which no frame refers to another, are decoded by one decoder, and one more for each
+# BYTES_PER_DECODER of a packet. Decoding that many bytes takes about as long as tracking the dots of a frame. More
+# decoders would only slow down the tracking.
+MAX_DECODERS, BYTES_PER_DECODER = 4, 40_000
 
 
-def frames_of_file(path: Path, frames: int, fps: float, notes: list[str]) -> Iterator[Frame]:
-    """Every frame of a video file in order; damaged ones, and those that refer to them, without a picture.
+def read_frames(path: Path, frames: int, fps: float, notes: list[str]) -> Iterator[Frame]:
+    """Yield every frame of a video file in order; damaged ones, and those that refer to them, have no image.
 
-    They are decoded in a thread of their own, a few ahead; each decoder works in one thread, which is what makes it
-    own up to damage.
+    A separate thread decodes a few frames in advance. Each decoder works in one thread, since only then it reports
+    damage.
 
     Args:
         path: of the file.
-        frames: how many the container announces; 0 where it does not.
-        fps: frames per second that it announces; 0 where it does not.
-        notes: is added what contradicts itself.
+        frames: number of frames that the container announces; 0 if it does not.
+        fps: frames per second that the container announces; 0 if it does not.
+        notes: contradictions in the file are appended.
 
     Raises:
-        InputError: nothing decodes.
+        InputError: nothing can be decoded.
     """
-    shown: list[float] = []
+    times: list[float] = []
     try:
-        with closing(_pieces(path, notes)) as pieces:
-            for frame in Order().frames(pieces):
-                shown.append(frame.time)
+        with closing(_decoded_packets(path, notes)) as packets:
+            for frame in FrameOrder().frames(packets):
+                times.append(frame.time)
                 yield frame
     except (av.FFmpegError, OSError) as error:
-        if not shown:
+        if not times:
             raise InputError(
                 f"{path}: no frame can be decoded ({error}); copy the video again from the camera"
             ) from None
-        notes.append(f"{path.name}: reading stopped after frame {len(shown) - 1} ({error})")
-    if not shown:
+        notes.append(f"{path.name}: reading stopped after frame {len(times) - 1} ({error})")
+    if not times:
         raise InputError(f"expected frames in {path}, found none; copy the video again from the camera")
-    notes += _contradictions(path.name, frames, fps, np.array(shown))
+    notes += _contradictions(path.name, frames, fps, np.array(times))
 
 
-def _pieces(path: Path, notes: list[str]) -> Generator[Piece]:
-    """A video file's packets and what they decode to, ahead in another thread."""
+def _decoded_packets(path: Path, notes: list[str]) -> Generator[DecodedPacket]:
+    """Yield a video file's packets and what they decode to, in advance in another thread."""
     with ExitStack() as stack:
-        container = stack.enter_context(opened(path))
+        container = stack.enter_context(open_container(path))
         stream = container.streams.video[0]
-        outcomes = stack.enter_context(closing(_outcomes(path, container, stream, notes)))
+        results = stack.enter_context(closing(_decoding_results(path, container, stream, notes)))
         extradata = stream.codec_context.extradata
-        units = Units.of("h264", extradata) if stream.codec_context.codec.name == "h264" else None
-        renewals, told = None if units is None else Renewals(units), units is not None
-        for packet, frames, damaged in outcomes:
-            stamp = packet.pts if packet.size else None
+        units = NalUnits.of("h264", extradata) if stream.codec_context.codec.name == "h264" else None
+        access_points, reports_all_damage = None if units is None else RandomAccessPoints(units), units is not None
+        for packet, frames, damaged in results:
+            timestamp = packet.pts if packet.size else None
             if units is not None and packet.size:
-                told = told and units.parts(bytes(packet)) == 1  # where there are several, one may be lost in silence
-            since = (0 if packet.is_keyframe else None) if renewals is None else renewals.since(packet)
-            unstamped = packet.size > 0 and stamp is None
-            yield Piece(stamp, since is not None, float(packet.time_base), frames, damaged, since or 0, unstamped, told)
+                # Of several slices one may be lost without a report.
+                reports_all_damage = reports_all_damage and units.count_slices(bytes(packet)) == 1
+            if access_points is None:
+                refresh_packets = 0 if packet.is_keyframe else None
+            else:
+                refresh_packets = access_points.refresh_packets(packet)
+            yield DecodedPacket(
+                timestamp,
+                refresh_packets is not None,
+                float(packet.time_base),
+                frames,
+                damaged,
+                refresh_packets or 0,
+                lacks_timestamp=packet.size > 0 and timestamp is None,
+                reports_all_damage=reports_all_damage,
+            )
 
 
-def _outcomes(
+def _decoding_results(
     path: Path, container: "av.container.InputContainer", stream: "av.video.stream.VideoStream", notes: list[str]
-) -> Generator[Outcome]:
-    """A file's packets and what they decode to; whatever can be left to other threads is."""
+) -> Generator[DecodingResult]:
+    """Yield a file's packets and what they decode to; as much of the work as possible runs in other threads."""
     codec = stream.codec_context.codec
-    packets = packets_of(container, stream, notes)
+    packets = read_packets(container, stream, notes)
     if not codec.intra_only and codec.name != "hevc":
-        # The one decoder has a thread to itself: what else there is to do would keep it waiting.
+        # The only decoder has a thread to itself; any other work there would delay it.
         decoder = FFmpegDecoder(stream)
-        decoded = ((packet, *decoder.decoded(packet)) for packet in packets)
-        with closing(ahead(decoded, lambda each: sum(map(luma_size, each[1])))) as made:
-            yield from starmap(decoder.taken, made)
+        decoded = ((packet, *decoder.decode_packet(packet)) for packet in packets)
+        with closing(prefetch(decoded, lambda item: sum(map(luma_bytes, item[1])))) as items:
+            yield from starmap(decoder.convert, items)
         return
     with ExitStack() as stack:
-        count = min(MOST_DECODERS, os.cpu_count() or 1, _decoders_worth(path)) if codec.intra_only else 1
+        count = min(MAX_DECODERS, os.cpu_count() or 1, _useful_decoder_count(path)) if codec.intra_only else 1
         decoders: list[Decoder]
         if codec.name == "mjpeg" and (jpeg := JpegDecoder.of(path)) is not None:
             decoders = [jpeg.decode] * count
@@ -103,62 +118,64 @@ def _outcomes(
             decoders = [HevcDecoder.of(stream, stack.enter_context(ThreadPoolExecutor(cores)), cores).decode]
         else:
             streams = [stream]
-            streams += [stack.enter_context(opened(path)).streams.video[0] for _ in range(1, count)]
+            streams += [stack.enter_context(open_container(path)).streams.video[0] for _ in range(1, count)]
             decoders = [FFmpegDecoder(each).decode for each in streams]
-        outcomes = _all_decoded(packets, decoders)
-        yield from stack.enter_context(closing(ahead(outcomes, lambda each: sum(frame.size() for frame in each[1]))))
+        results = _decode_all(packets, decoders)
+        yield from stack.enter_context(
+            closing(prefetch(results, lambda result: sum(frame.image_bytes() for frame in result[1])))
+        )
 
 
-def _decoders_worth(path: Path) -> int:
-    """How many decoders keep pace with following the dots, by the size of a video's first packet."""
-    with opened(path) as container:
-        first = next(packets_of(container, container.streams.video[0], []), None)
-        return 1 + (0 if first is None else first.size // BYTES_EACH)
+def _useful_decoder_count(path: Path) -> int:
+    """How many decoders keep pace with tracking the dots, judged by the size of a video's first packet."""
+    with open_container(path) as container:
+        first = next(read_packets(container, container.streams.video[0], []), None)
+        return 1 + (0 if first is None else first.size // BYTES_PER_DECODER)
 
 
-def _all_decoded(packets: Iterator["av.packet.Packet"], decoders: list[Decoder]) -> Generator[Outcome]:
-    """What comes of packets, in their order."""
-    handfuls = iter(lambda: list(islice(packets, TOGETHER)), [])
+def _decode_all(packets: Iterator["av.packet.Packet"], decoders: list[Decoder]) -> Generator[DecodingResult]:
+    """Yield what packets decode to, in their order; each decoder works in a thread of its own if there are several."""
+    batches = iter(lambda: list(islice(packets, PACKETS_PER_TASK)), [])
     if len(decoders) == 1:
-        for handful in handfuls:
-            yield from decoders[0](handful)
+        for batch in batches:
+            yield from decoders[0](batch)
         return
     idle: queue.SimpleQueue[Decoder] = queue.SimpleQueue()
     for decoder in decoders:
         idle.put(decoder)
 
-    def work(handful: list["av.packet.Packet"]) -> list[Outcome]:
+    def decode(batch: list["av.packet.Packet"]) -> list[DecodingResult]:
         decoder = idle.get()
         try:
-            return decoder(handful)
+            return decoder(batch)
         finally:
             idle.put(decoder)
 
-    begun: deque[Future[list[Outcome]]] = deque()
+    tasks: deque[Future[list[DecodingResult]]] = deque()
     with ThreadPoolExecutor(len(decoders)) as pool:
-        for handful in handfuls:
-            begun.append(pool.submit(work, handful))
-            if len(begun) > len(decoders):
-                yield from begun.popleft().result()
-        for result in begun:
-            yield from result.result()
+        for batch in batches:
+            tasks.append(pool.submit(decode, batch))
+            if len(tasks) > len(decoders):
+                yield from tasks.popleft().result()
+        for task in tasks:
+            yield from task.result()
 
 
-def _contradictions(name: str, frames: int, fps: float, time: NDArray) -> list[str]:
-    """What the container says that its frames do not bear out."""
+def _contradictions(name: str, frames: int, fps: float, time: Array) -> list[str]:
+    """Describe what the container announces and its frames contradict; `time` is that of the frames [s], (T)."""
     notes = []
     if frames and frames != len(time):
         notes.append(f"{name}: the file announces {frames} frames and holds {len(time)}")
     step = np.diff(time[np.isfinite(time)])
     if len(step) and (step <= 0).any():
-        notes.append(f"{name}: {int((step <= 0).sum())} frames are stamped no later than the one before")
+        notes.append(f"{name}: {int((step <= 0).sum())} frames have a timestamp no later than the frame before")
     elif len(step) > 1 and fps:
         rate = 1.0 / float(np.median(step))
         if abs(rate / fps - 1.0) > 0.02:
             notes.append(
-                f"{name}: the file announces {fps:.6g} frames/s, its time stamps {rate:.6g}; the time stamps are used"
+                f"{name}: the file announces {fps:.6g} frames/s, its timestamps {rate:.6g}; the timestamps are used"
             )
         gaps = int((step > 1.5 * np.median(step)).sum())
         if gaps:
-            notes.append(f"{name}: {gaps} gaps in the time stamps, where frames were dropped")
+            notes.append(f"{name}: {gaps} gaps in the timestamps, where frames were dropped")
     return notes

@@ -1,197 +1,212 @@
-"""Frames in the order in which they are shown; those that damage has spoilt without a picture."""
+"""Arrange decoded frames in display order; frames affected by damage come without an image."""
 
 import heapq
 from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
 from rafl.tracking.video.frame import Frame
 
-DEEPEST = 32  # frames that may be shown before one that they refer to: H.264 and HEVC allow 16
+Array = NDArray[Any]
+
+MAX_REORDERED_FRAMES = 32  # frames that may be shown before one that they refer to; H.264 and HEVC allow 16
 
 
 @dataclass(frozen=True)
-class Decoded:
-    """A frame as it comes out of the decoder.
+class DecodedFrame:
+    """A frame as the decoder outputs it.
 
     Attributes:
-        stamp: when it is shown, in the stream's own unit; None where it does not say.
-        picture: grey levels, see `Frame`; None where damaged.
-        steps: by which it was rounded, see `Frame`.
-        lag: see `Frame`.
+        timestamp: display time in units of the stream's time base; None if the stream does not say.
+        image: see `Frame`; None if damaged.
+        quantisation_steps: see `Frame`.
+        lag_factor: see `Frame`.
     """
 
-    stamp: int | None
-    picture: NDArray | None
-    steps: NDArray | None
-    lag: float = 1.0
+    timestamp: int | None
+    image: Array | None
+    quantisation_steps: Array | None
+    lag_factor: float = 1.0
 
-    def size(self) -> int:
-        """Of the picture [bytes]."""
-        return 0 if self.picture is None else self.picture.nbytes
+    def image_bytes(self) -> int:
+        """Size of the image in memory [bytes]."""
+        return 0 if self.image is None else self.image.nbytes
 
 
 @dataclass(frozen=True)
-class Piece:
-    """What a packet says of the frame in it, and what came out of the decoder after it.
+class DecodedPacket:
+    """A packet's properties, and the decoder's output after it.
 
     Attributes:
-        stamp: when its frame is shown, in the stream's own unit; None where it does not say.
-        key: whether nothing before its frame is needed for those that are shown after it.
-        unit: of the stamp [s].
-        frames: those that were ready.
-        complained: whether the decoder found damage.
-        since: how many packets before a key frame's it needs, where pictures are renewed bit by bit.
-        unstamped: holds a frame without a stamp.
-        told: whether the decoder tells of all damage with the packet, not only with the frame.
+        timestamp: display time of the packet's frame in units of `time_base`; None if the packet does not say.
+        random_access: whether the frames that are shown after this one need no frame before it (but see
+            `refresh_packets`).
+        time_base: unit of the timestamps [s].
+        frames: the frames that the decoder has output.
+        damaged: whether the decoder found damage.
+        refresh_packets: number of packets before this one that are still needed, under periodic intra refresh.
+        lacks_timestamp: whether the packet holds a frame without a timestamp.
+        reports_all_damage: whether the decoder reports all damage with the packet, not only with the output frame.
     """
 
-    stamp: int | None
-    key: bool
-    unit: float
-    frames: list[Decoded]
-    complained: bool
-    since: int = 0
-    unstamped: bool = False
-    told: bool = False
+    timestamp: int | None
+    random_access: bool
+    time_base: float
+    frames: list[DecodedFrame]
+    damaged: bool
+    refresh_packets: int = 0
+    lacks_timestamp: bool = False
+    reports_all_damage: bool = False
 
 
 @dataclass(frozen=True)
-class _Packet:
-    """Where a frame stands among the others.
+class _PendingFrame:
+    """A frame that has not been shown yet.
 
     Attributes:
-        number: in the order of decoding.
-        first: the number of the earliest that it may refer to: its group's key frame, or, if it is shown before that,
-            the key frame before.
-        last: the latest time stamp of all that were decoded up to it.
+        number: of its packet, in decoding order.
+        first_reference: number of the earliest packet that it may refer to. This is the key frame of its group, or the
+            key frame before that one if the frame is shown before its group's key frame.
+        latest_timestamp: of all packets up to this one.
     """
 
     number: int
-    first: int
-    last: int
+    first_reference: int
+    latest_timestamp: int
 
 
 @dataclass
-class Order:
-    """Puts frames into the order in which they are shown, each in its slot.
+class FrameOrder:
+    """Arranges frames in display order, each in its slot.
 
-    Every packet has a slot by its time stamp. A frame that comes out of the decoder fills its own; slots before it
-    that are still empty were lost, and what comes for them later is dropped. A damaged frame spoils those decoded after
-    it that may refer to it. Some decoders own up to damage only when the frame comes out, and frames that refer to
-    it may be shown before it: of theirs none is given on before all that were decoded before it are out.
+    Every packet has a slot at its timestamp. A decoded frame fills its own slot. Empty slots before it are lost, and a
+    frame that arrives for them later is dropped. A damaged frame also spoils those decoded after it that may refer to
+    it. Some decoders report damage only when they output the frame, and frames that refer to it may be shown before
+    it. With such a decoder a frame is passed on only after all frames decoded before it have been output.
     """
 
-    packets: dict[int, _Packet] = field(default_factory=dict)
-    waiting: list[int] = field(default_factory=list)
-    held: deque[Decoded] = field(default_factory=deque)
-    gone: set[int] = field(default_factory=set)  # stamps of lost slots
-    damaged: list[int] = field(default_factory=list)  # numbers of packets, in their order
-    count: int = 0
-    first: int = 0  # that frames from the last key frame on may refer to
-    before: int = 0  # that those shown before it may
-    key: int | None = None  # the last one's stamp
+    pending: dict[int, _PendingFrame] = field(default_factory=dict)  # by timestamp
+    empty_slots: list[int] = field(default_factory=list)  # heap of timestamps
+    held: deque[DecodedFrame] = field(default_factory=deque)
+    lost: set[int] = field(default_factory=set)  # timestamps of lost slots
+    damaged: list[int] = field(default_factory=list)  # sorted numbers of packets
+    count: int = 0  # packets so far
+    first_reference: int = 0  # of frames shown after the last key frame
+    leading_reference: int = 0  # first reference of frames shown before the last key frame
+    key_timestamp: int | None = None  # of the last key frame
     key_number: int = 0
-    unstamped: int = 0  # frames without stamps that are to come
-    depth: int = 0  # the most of them before any was damaged
-    last: int | None = None  # latest stamp of all packets
-    start: int | None = None
-    base: float = 0.0  # seconds in a unit of the stamps
-    shape: tuple[int, ...] | None = None  # of the first picture
+    unstamped: int = 0  # frames without timestamps that the decoder has not output yet
+    max_unstamped: int = 0  # largest number of them before the first damage
+    latest_timestamp: int | None = None  # of all packets
+    start: int | None = None  # timestamp of the first frame
+    time_base: float = 0.0  # unit of the timestamps [s]
+    shape: tuple[int, ...] | None = None  # of the first image
 
-    def frames(self, pieces: Iterable[Piece]) -> Iterator[Frame]:
-        """The frames of pieces in the order of decoding, as they can be given on."""
-        for piece in pieces:
-            self._expect(piece)
-            if piece.complained:
-                self._spoil(piece.stamp)
-            while piece.frames:
-                yield from self._shown(piece.frames.pop(0), piece.told)
+    def frames(self, packets: Iterable[DecodedPacket]) -> Iterator[Frame]:
+        """Yield the frames of packets, given in decoding order, as soon as their order and damage are known."""
+        for packet in packets:
+            self._add_packet(packet)
+            if packet.damaged:
+                self._mark_damaged(packet.timestamp)
+            while packet.frames:
+                yield from self._add_frame(packet.frames.pop(0), packet.reports_all_damage)
             if not self.damaged:
-                self.depth = max(self.depth, self.unstamped)
-            yield from self._overdue(self.depth)
+                self.max_unstamped = max(self.max_unstamped, self.unstamped)
+            yield from self._overdue_frames(self.max_unstamped)
         while self.held:
-            yield from self._given_on(self.held.popleft())
-        yield from self._lost(None)
-        yield from self._overdue(0)
+            yield from self._release(self.held.popleft())
+        yield from self._lost_frames(None)
+        yield from self._overdue_frames(0)
 
-    def _expect(self, piece: Piece) -> None:
-        """Takes note of a packet whose frame is to come out."""
-        stamp = piece.stamp
-        self.base = self.base or piece.unit
+    def _add_packet(self, packet: DecodedPacket) -> None:
+        """Create the slot for a packet's frame."""
+        timestamp = packet.timestamp
+        self.time_base = self.time_base or packet.time_base
         self.count += 1
-        self.unstamped += piece.unstamped
-        if piece.key:
-            self.before, self.first = self.first, self.count - piece.since
-            self.key, self.key_number = stamp, self.count
-        if stamp is not None:
-            self.last = stamp if self.last is None else max(self.last, stamp)
-            leading = self.key is not None and stamp < self.key
-            self.packets[stamp] = _Packet(self.count, self.before if leading else self.first, self.last)
-            heapq.heappush(self.waiting, stamp)
+        self.unstamped += packet.lacks_timestamp
+        if packet.random_access:
+            self.leading_reference, self.first_reference = self.first_reference, self.count - packet.refresh_packets
+            self.key_timestamp, self.key_number = timestamp, self.count
+        if timestamp is not None:
+            self.latest_timestamp = (
+                timestamp if self.latest_timestamp is None else max(self.latest_timestamp, timestamp)
+            )
+            leading = self.key_timestamp is not None and timestamp < self.key_timestamp
+            first_reference = self.leading_reference if leading else self.first_reference
+            self.pending[timestamp] = _PendingFrame(self.count, first_reference, self.latest_timestamp)
+            heapq.heappush(self.empty_slots, timestamp)
 
-    def _spoil(self, stamp: int | None) -> None:
-        """What is stamped so is damaged; without a stamp, what was decoded last."""
-        packet = None if stamp is None else self.packets.get(stamp)
-        number = self.count if packet is None else packet.number
+    def _mark_damaged(self, timestamp: int | None) -> None:
+        """Mark the packet with this timestamp as damaged; without a timestamp, the packet decoded last."""
+        pending = None if timestamp is None else self.pending.get(timestamp)
+        number = self.count if pending is None else pending.number
         if number not in self.damaged[-1:]:
             insort(self.damaged, number)
 
-    def _shown(self, frame: Decoded, told: bool) -> Iterator[Frame]:
-        """The frames that can be given on once this one is out."""
-        if self.shape is None and frame.picture is not None:
-            self.shape = frame.picture.shape
-        if frame.picture is None or frame.picture.shape != self.shape:  # damage may turn pictures, too
-            self._spoil(frame.stamp)
-        if frame.stamp not in self.gone:
+    def _add_frame(self, frame: DecodedFrame, reports_all_damage: bool) -> Iterator[Frame]:
+        """Yield the frames that can be passed on after the decoder has output this one."""
+        if self.shape is None and frame.image is not None:
+            self.shape = frame.image.shape
+        if frame.image is None or frame.image.shape != self.shape:  # damage may also change the rotation
+            self._mark_damaged(frame.timestamp)
+        if frame.timestamp not in self.lost:
             self.held.append(frame)
-        while self.held and (told or len(self.held) > DEEPEST or self._is_ready(self.held[0], frame.stamp)):
-            yield from self._given_on(self.held.popleft())
+        while self.held and (
+            reports_all_damage or len(self.held) > MAX_REORDERED_FRAMES or self._is_ready(self.held[0], frame.timestamp)
+        ):
+            yield from self._release(self.held.popleft())
 
-    def _is_ready(self, frame: Decoded, out: int | None) -> bool:
-        packet = None if frame.stamp is None else self.packets.get(frame.stamp)
-        return packet is None or out is None or packet.last <= out
+    def _is_ready(self, frame: DecodedFrame, output_timestamp: int | None) -> bool:
+        """Whether all frames decoded before this one have been output."""
+        pending = None if frame.timestamp is None else self.pending.get(frame.timestamp)
+        return pending is None or output_timestamp is None or pending.latest_timestamp <= output_timestamp
 
-    def _given_on(self, frame: Decoded) -> Iterator[Frame]:
-        if frame.stamp is None:
+    def _release(self, frame: DecodedFrame) -> Iterator[Frame]:
+        """Yield the lost frames before a frame, and the frame."""
+        if frame.timestamp is None:
             self.unstamped -= 1
-            yield _shown_at(np.nan, frame, self._is_sound(None))
+            yield _output_frame(np.nan, frame, self._is_intact(None))
             return
-        yield from self._lost(frame.stamp)
-        sound = self._is_sound(self.packets.pop(frame.stamp, None))
-        yield _shown_at(self._time(frame.stamp), frame, sound)
+        yield from self._lost_frames(frame.timestamp)
+        intact = self._is_intact(self.pending.pop(frame.timestamp, None))
+        yield _output_frame(self._time(frame.timestamp), frame, intact)
 
-    def _is_sound(self, packet: _Packet | None) -> bool:
-        if packet is None:  # it may be one that was decoded before the last key frame
-            packet = _Packet(self.count, self.first if self.count - self.key_number > DEEPEST else self.before, 0)
-        place = bisect_left(self.damaged, packet.first)
-        return place == len(self.damaged) or self.damaged[place] > packet.number
+    def _is_intact(self, pending: _PendingFrame | None) -> bool:
+        """Whether neither the frame nor any that it may refer to is damaged."""
+        if pending is None:  # the frame may have been decoded before the last key frame
+            after_key = self.count - self.key_number > MAX_REORDERED_FRAMES
+            pending = _PendingFrame(self.count, self.first_reference if after_key else self.leading_reference, 0)
+        index = bisect_left(self.damaged, pending.first_reference)
+        return index == len(self.damaged) or self.damaged[index] > pending.number
 
-    def _lost(self, stamp: int | None) -> Iterator[Frame]:
-        """The slots before `stamp`, or all that are left."""
-        while self.waiting and (stamp is None or self.waiting[0] < stamp):
-            lost = heapq.heappop(self.waiting)
-            self.packets.pop(lost, None)
-            self.gone.add(lost)
+    def _lost_frames(self, timestamp: int | None) -> Iterator[Frame]:
+        """Yield a frame without an image for each empty slot before `timestamp`, or for all if it is None."""
+        while self.empty_slots and (timestamp is None or self.empty_slots[0] < timestamp):
+            lost = heapq.heappop(self.empty_slots)
+            self.pending.pop(lost, None)
+            self.lost.add(lost)
             yield Frame(self._time(lost), None)
-        if self.waiting and self.waiting[0] == stamp:
-            heapq.heappop(self.waiting)
+        if self.empty_slots and self.empty_slots[0] == timestamp:
+            heapq.heappop(self.empty_slots)
 
-    def _overdue(self, depth: int) -> Iterator[Frame]:
-        """Frames without stamps, once damaged ones are among them, of which more are to come than ever before."""
-        while self.damaged and self.unstamped > depth:
+    def _overdue_frames(self, max_unstamped: int) -> Iterator[Frame]:
+        """After damage, yield the frames without timestamps that exceed the largest delay seen before, as lost."""
+        while self.damaged and self.unstamped > max_unstamped:
             self.unstamped -= 1
             yield Frame(np.nan, None)
 
-    def _time(self, stamp: int) -> float:
+    def _time(self, timestamp: int) -> float:
+        """Time since the first frame [s]."""
         if self.start is None:
-            self.start = stamp
-        return (stamp - self.start) * self.base
+            self.start = timestamp
+        return (timestamp - self.start) * self.time_base
 
 
-def _shown_at(time: float, frame: Decoded, sound: bool) -> Frame:
-    """A frame in its place, which shows nothing unless it is sound."""
-    return Frame(time, frame.picture, frame.steps, frame.lag) if sound else Frame(time, None)
+def _output_frame(time: float, frame: DecodedFrame, intact: bool) -> Frame:
+    """Frame at its time, without an image unless it is intact."""
+    return Frame(time, frame.image, frame.quantisation_steps, frame.lag_factor) if intact else Frame(time, None)

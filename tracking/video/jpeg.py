@@ -1,7 +1,8 @@
-"""Packets of Motion JPEG turned into pictures by libjpeg-turbo, in half of FFmpeg's time, and files looked through.
+"""Decode Motion JPEG with libjpeg-turbo, in half of FFmpeg's time, and check JPEG files for damage.
 
-It also tells when a picture's code is longer than the picture. FFmpeg does not: a tenth of the packets in which bytes
-were overwritten come out of it as pictures that are wrong, a fiftieth here. One bit turned may read as valid to both.
+libjpeg-turbo also reports a packet whose code is longer than the image, which FFmpeg does not. Of packets in which
+bytes were overwritten, FFmpeg decodes a tenth to wrong images, libjpeg-turbo a fiftieth. Neither may notice a single
+flipped bit.
 """
 
 from dataclasses import dataclass
@@ -12,16 +13,17 @@ import av
 import numpy as np
 import simplejpeg
 from numpy.typing import NDArray
-from rafl.tracking.video.ffmpeg import FFmpegDecoder, Outcome, grey, opened, packets_of
+
+from rafl.tracking.video.ffmpeg import DecodingResult, FFmpegDecoder, grey_image, open_container, read_packets
 from rafl.tracking.video.frame import quarter_turns
-from rafl.tracking.video.frame_order import Decoded
+from rafl.tracking.video.frame_order import DecodedFrame
 
-PROBED = 5  # first packets or files, of which one may be refused
-ROUNDED = 1.0  # grey levels by which two decoders of the same code may differ in the mean
+PROBE_COUNT = 5  # first packets or files to check; at most one of them may be rejected
+MAX_DIFFERENCE = 1.0  # mean absolute difference of two decoders on the same image [grey levels]
 
 
-def is_whole(content: bytes) -> bool:
-    """Whether a JPEG file is read without complaint; in less than half the time that a picture of it takes."""
+def is_intact_jpeg(content: bytes) -> bool:
+    """Whether a JPEG file is decoded without an error; takes less than half the time of decoding it in full."""
     try:
         simplejpeg.decode_jpeg(content, "GRAY", min_height=1, min_width=1, min_factor=8)
     except ValueError:
@@ -31,11 +33,11 @@ def is_whole(content: bytes) -> bool:
 
 @dataclass(frozen=True)
 class JpegDecoder:
-    """The decoder of a video whose pictures are of one size; for as many threads as one likes.
+    """Decoder of a video whose frames all have one size; any number of threads may share it.
 
     Attributes:
-        shape: of the pictures as they are stored, (H, W).
-        turns: quarter turns anticlockwise by which they are to be shown.
+        shape: of the images as stored, (H, W).
+        turns: anticlockwise quarter turns by which they are to be displayed.
     """
 
     shape: tuple[int, int]
@@ -43,36 +45,36 @@ class JpegDecoder:
 
     @classmethod
     def of(cls, path: Path) -> "JpegDecoder | None":
-        """For a video that it reads as FFmpeg does; None for others, as some cameras leave bytes where none belong."""
+        """Decoder for a video; None if its images differ from FFmpeg's, as with cameras that leave stray bytes."""
         agreed: list[JpegDecoder] = []
-        refused = 0
-        with opened(path) as container:
+        rejected = 0
+        with open_container(path) as container:
             stream = container.streams.video[0]
             ffmpeg = FFmpegDecoder(stream)
-            for packet in islice(packets_of(container, stream, []), PROBED):
-                frames, complained = ffmpeg.decoded(packet)
-                if complained or len(frames) != 1:
+            for packet in islice(read_packets(container, stream, []), PROBE_COUNT):
+                frames, damaged = ffmpeg.decode_packet(packet)
+                if damaged or len(frames) != 1:
                     continue
                 frame = frames[0]
                 decoder = cls((frame.height, frame.width), quarter_turns(frame))
-                picture = decoder.picture(packet)
-                if picture is None or abs(picture.astype(np.int16) - grey(frame, copy=False)).mean() > ROUNDED:
-                    refused += 1
+                image = decoder.decode_image(packet)
+                if image is None or abs(image.astype(np.int16) - grey_image(frame, copy=False)).mean() > MAX_DIFFERENCE:
+                    rejected += 1
                 else:
                     agreed.append(decoder)
-        return agreed[0] if agreed and refused <= 1 else None
+        return agreed[0] if agreed and rejected <= 1 else None
 
-    def decode(self, packets: list["av.packet.Packet"]) -> list[Outcome]:
-        """Packets, each with the frame in it, and whether it is damaged."""
-        outcomes: list[Outcome] = []
+    def decode(self, packets: list["av.packet.Packet"]) -> list[DecodingResult]:
+        """Decode packets: each with its frame, and whether it is damaged."""
+        results: list[DecodingResult] = []
         for packet in packets:
-            picture = self.picture(packet) if packet.size and not packet.is_corrupt else None
-            frames = [] if picture is None else [Decoded(packet.pts, picture, None)]
-            outcomes.append((packet, frames, packet.size > 0 and picture is None))
-        return outcomes
+            image = self.decode_image(packet) if packet.size and not packet.is_corrupt else None
+            frames = [] if image is None else [DecodedFrame(packet.pts, image, None)]
+            results.append((packet, frames, packet.size > 0 and image is None))
+        return results
 
-    def picture(self, packet: "av.packet.Packet") -> NDArray[np.uint8] | None:
-        """Its luma plane, turned as it is to be shown; None where it is not as it should be."""
+    def decode_image(self, packet: "av.packet.Packet") -> NDArray[np.uint8] | None:
+        """Decode the luma plane of a packet, rotated for display; None if it is damaged or of another size."""
         memory = np.empty((*self.shape, 1), np.uint8)
         try:
             decoded = simplejpeg.decode_jpeg(packet, "GRAY", buffer=memory)

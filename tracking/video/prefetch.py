@@ -1,4 +1,4 @@
-"""What is needed soon is made before it is asked for, in a thread of its own."""
+"""Run a generator ahead of its reader in a thread of its own."""
 
 import queue
 import threading
@@ -6,53 +6,53 @@ from collections.abc import Callable, Generator
 from contextlib import closing
 from typing import TypeVar
 
-Thing = TypeVar("Thing")
+Item = TypeVar("Item")
 
-AHEAD = 48 * 2**20  # bytes of pictures decoded before they are asked for, as the first takes its time
-LEAST = 2**18  # bytes that a thing counts for
+MAX_PREFETCH_BYTES = 48 * 2**20  # of images decoded in advance; they accumulate while the first frame is processed
+MIN_ITEM_BYTES = 2**18  # smaller items count as this many
 
 
-def ahead(source: Generator[Thing], size_of: Callable[[Thing], int]) -> Generator[Thing]:
-    """The same things, made in a thread of their own.
+def prefetch(source: Generator[Item], size_of: Callable[[Item], int]) -> Generator[Item]:
+    """Yield the source's items, which a separate thread produces in advance.
 
-    Each is handed over at once: where many were on their way, the processor's cache would not hold them all, and
-    whoever makes the next would wait for memory.
+    Each item is handed over singly. Batches would overflow the processor's cache, and the producer would wait for
+    memory. An exception of the source is raised after the items before it. Closing the generator closes the source.
 
     Args:
-        source: makes them.
-        size_of: one of them [bytes].
+        source: produces the items.
+        size_of: size of an item [bytes].
     """
-    # These queues are far quicker than those that have a length: decoding hardly notices them.
-    made: queue.SimpleQueue[tuple[list[Thing], int] | Exception | None] = queue.SimpleQueue()
-    taken: queue.SimpleQueue[int | None] = queue.SimpleQueue()  # bytes; None where no more is wanted
+    # SimpleQueue is far faster than a queue of bounded length; its cost beside decoding is negligible.
+    produced: queue.SimpleQueue[tuple[list[Item], int] | Exception | None] = queue.SimpleQueue()
+    consumed: queue.SimpleQueue[int | None] = queue.SimpleQueue()  # bytes; None tells the thread to stop
 
-    def work() -> None:
-        room = AHEAD
+    def produce() -> None:
+        free_bytes = MAX_PREFETCH_BYTES
         try:
             with closing(source):
-                for thing in source:
-                    size = max(size_of(thing), LEAST)
-                    made.put(([thing], size))
-                    del thing
-                    room -= size
-                    while room < 0 or not taken.empty():
-                        back = taken.get()
-                        if back is None:
+                for item in source:
+                    size = max(size_of(item), MIN_ITEM_BYTES)
+                    produced.put(([item], size))
+                    del item
+                    free_bytes -= size
+                    while free_bytes < 0 or not consumed.empty():
+                        returned = consumed.get()
+                        if returned is None:
                             return
-                        room += back
-            made.put(None)
-        except Exception as error:  # handed to whoever reads
-            made.put(error)
+                        free_bytes += returned
+            produced.put(None)
+        except Exception as error:  # raised again in the reader's thread
+            produced.put(error)
 
-    thread = threading.Thread(target=work, daemon=True)
+    thread = threading.Thread(target=produce, daemon=True)
     thread.start()
     try:
-        while (item := made.get()) is not None:
-            if isinstance(item, Exception):
-                raise item
-            things, size = item
-            taken.put(size)
-            yield things.pop()  # and keeps no picture that nobody else does
+        while (message := produced.get()) is not None:
+            if isinstance(message, Exception):
+                raise message
+            items, size = message
+            consumed.put(size)
+            yield items.pop()  # so that no reference to the image remains here
     finally:
-        taken.put(None)
+        consumed.put(None)
         thread.join()

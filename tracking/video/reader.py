@@ -1,34 +1,38 @@
-"""Grey pictures and their times out of video files and folders of images."""
+"""Grey images and their times from video files and folders of images."""
 
 import re
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rafl.tracking.video.decoding import frames_of_file
-from rafl.tracking.video.ffmpeg import opened, packets_of
-from rafl.tracking.video.frame import Frame, quarter_turns, scaled
-from rafl.tracking.video.jpeg import PROBED, is_whole
-from rafl.tracking.video.prefetch import ahead
 
 from rafl.common.errors import InputError
+from rafl.tracking.video.decoding import read_frames
+from rafl.tracking.video.ffmpeg import open_container, read_packets
+from rafl.tracking.video.frame import Frame, quarter_turns, scale_to_eight_bits
+from rafl.tracking.video.jpeg import PROBE_COUNT, is_intact_jpeg
+from rafl.tracking.video.prefetch import prefetch
+
+Array = NDArray[Any]
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg", ".mpeg", ".ts"}
 JPEG_SUFFIXES = {".jpg", ".jpeg"}
-PICTURE_SUFFIXES = {".png", ".tif", ".tiff", ".bmp"} | JPEG_SUFFIXES
+IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".bmp"} | JPEG_SUFFIXES
 
 
 @dataclass
 class Reading:
-    """A video being read: iterate for its frames.
+    """A video being read; iterate over it for its frames.
 
     Attributes:
-        notes: what was found on the way that contradicts itself; complete after the last frame.
+        frames: the frames that are left.
+        notes: contradictions found in the file; complete after the last frame.
     """
 
     frames: Iterator[Frame]
@@ -40,13 +44,13 @@ class Reading:
 
 @dataclass(frozen=True)
 class Video:
-    """A video file, or a folder of numbered pictures.
+    """A video file, or a folder of numbered images.
 
     Attributes:
         path: of the file or folder.
-        size: width, height, as shown [px].
-        frames: how many, as far as the container says; 0 where it does not.
-        fps: frames per second, as far as the container says; 0 where it does not.
+        size: width and height as displayed [px].
+        frames: number of frames that the container announces; 0 if it does not.
+        fps: frames per second that the container announces; 0 if it does not.
     """
 
     path: Path
@@ -55,15 +59,15 @@ class Video:
     fps: float
 
     def read(self) -> Reading:
-        """Every frame in order, decoded in a thread of its own, a few ahead.
+        """Read every frame in order; a separate thread decodes a few frames in advance.
 
-        Damaged frames come without a picture, and so do those that refer to them.
+        Damaged frames, and those that refer to them, have no image.
         """
         reading = Reading(iter(()))
         if self.path.is_dir():
-            reading.frames = ahead(_folder_frames(self.path), lambda frame: frame.size())
+            reading.frames = prefetch(_read_folder(self.path), lambda frame: frame.image_bytes())
         else:
-            reading.frames = frames_of_file(self.path, self.frames, self.fps, reading.notes)
+            reading.frames = read_frames(self.path, self.frames, self.fps, reading.notes)
         return reading
 
 
@@ -73,41 +77,41 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
 
-def _pictures_in(folder: Path) -> list[Path]:
-    return sorted((path for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES), key=natural_key)
+def _image_paths(folder: Path) -> list[Path]:
+    return sorted((path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
 
 
 def is_video(path: Path) -> bool:
-    """Whether a path looks like a video file or a folder of pictures."""
+    """Whether a path is, by its name, a video file or a folder of images."""
     if path.is_dir():
-        return bool(_pictures_in(path))
+        return bool(_image_paths(path))
     return path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def open_video(path: Path) -> Video:
-    """Look at a video; only its first frame is decoded.
+    """Open a video; only its first frame is decoded.
 
     Raises:
         InputError: missing or unreadable.
     """
     if path.is_dir():
-        pictures = _pictures_in(path)
-        readable = (picture for picture in map(_reader_of(pictures), pictures) if picture is not None)
+        paths = _image_paths(path)
+        readable = (image for image in map(_image_reader(paths), paths) if image is not None)
         first = next(readable, None)
         if first is None:
-            raise InputError(f"expected pictures in {path}, none of which can be read; copy them again")
-        return Video(path, (first.shape[1], first.shape[0]), len(pictures), 0.0)
+            raise InputError(f"expected images in {path}, none of which can be read; copy them again")
+        return Video(path, (first.shape[1], first.shape[0]), len(paths), 0.0)
     try:
-        with opened(path) as container:
+        with open_container(path) as container:
             if not container.streams.video:
                 raise InputError(f"expected a video in {path}, found no video stream; export it again")
             stream = container.streams.video[0]
             fps = float(stream.average_rate) if stream.average_rate else 0.0
             frames = stream.frames
-            size = (getattr(stream, "width", 0), getattr(stream, "height", 0))  # absent where no decoder is known
+            size = (getattr(stream, "width", 0), getattr(stream, "height", 0))  # missing if no decoder is known
             if min(size) < 1:
                 raise InputError(f"expected a video in {path}, found {size[0]} x {size[1]} px; export it again")
-            if _quarter_turns(container, stream) % 2:
+            if _first_quarter_turns(container, stream) % 2:
                 size = (size[1], size[0])
             return Video(path, size, frames, fps)
     except (av.FFmpegError, OSError) as error:
@@ -116,9 +120,9 @@ def open_video(path: Path) -> Video:
         ) from None
 
 
-def _quarter_turns(container: "av.container.InputContainer", stream: "av.video.stream.VideoStream") -> int:
-    """How many quarter turns anticlockwise the first frame asks to be shown by."""
-    for packet in packets_of(container, stream, []):
+def _first_quarter_turns(container: "av.container.InputContainer", stream: "av.video.stream.VideoStream") -> int:
+    """Number of anticlockwise quarter turns by which the first frame is to be displayed."""
+    for packet in read_packets(container, stream, []):
         try:
             frames = packet.decode()
         except av.FFmpegError:
@@ -128,37 +132,47 @@ def _quarter_turns(container: "av.container.InputContainer", stream: "av.video.s
     return 0
 
 
-def _reader_of(pictures: list[Path]) -> Callable[[Path], NDArray | None]:
-    """Gives a file's picture; None where it cannot be read, or is a JPEG with damage that the others do not have."""
-    begun = pictures[:PROBED]
-    odd = sum(_read_picture(path) is not None and _read_picture(path, strict=True) is None for path in begun)
-    return partial(_read_picture, strict=odd <= 1)
+def _image_reader(paths: list[Path]) -> Callable[[Path], Array | None]:
+    """Function that reads an image file; it returns None for an unreadable file.
+
+    A damaged JPEG file counts as unreadable, unless several of the first files show damage, as some cameras leave stray
+    bytes in every file.
+    """
+    probed = paths[:PROBE_COUNT]
+    suspect = sum(_read_image(path) is not None and _read_image(path, strict=True) is None for path in probed)
+    return partial(_read_image, strict=suspect <= 1)
 
 
-def _read_picture(path: Path, strict: bool = False) -> NDArray | None:
+def _read_image(path: Path, strict: bool = False) -> Array | None:
+    """Read a grey image of up to 16 bits; None if unreadable, or with `strict` if it is a damaged JPEG file."""
     try:
         content = path.read_bytes()
-        if strict and path.suffix.lower() in JPEG_SUFFIXES and not is_whole(content):
+        if strict and path.suffix.lower() in JPEG_SUFFIXES and not is_intact_jpeg(content):
             return None
         return cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
-    except (OSError, cv2.error):  # OpenCV's, of files that are empty or claim to be huge
+    except (OSError, cv2.error):  # OpenCV raises the latter for files that are empty or claim a huge size
         return None
 
 
-def _folder_frames(folder: Path) -> Generator[Frame]:
+def _read_folder(folder: Path) -> Generator[Frame]:
+    """Yield the images of a folder as frames without times; unreadable ones have no image.
+
+    Raises:
+        InputError: the images differ in size.
+    """
     shape: tuple[int, ...] | None = None
     bits = 8
-    pictures = _pictures_in(folder)
-    read = _reader_of(pictures)
-    for path in pictures:
-        picture = read(path)
-        if picture is None:
+    paths = _image_paths(folder)
+    read_image = _image_reader(paths)
+    for path in paths:
+        image = read_image(path)
+        if image is None:
             yield Frame(np.nan, None)
             continue
         if shape is None:
-            # A 16-bit file may hold 10, 12 or 14 bits; the first picture decides.
-            bits = next(b for b in (8, 10, 12, 14, 16) if int(picture.max()) < 2**b)
-        elif picture.shape != shape:
-            raise InputError(f"expected pictures of one size in {folder}, found another in {path.name}; remove it")
-        shape = picture.shape
-        yield Frame(np.nan, picture if picture.dtype == np.uint8 else scaled(picture, bits))
+            # A 16-bit file may hold 10, 12 or 14 bits; the first image decides.
+            bits = next(b for b in (8, 10, 12, 14, 16) if int(image.max()) < 2**b)
+        elif image.shape != shape:
+            raise InputError(f"expected images of one size in {folder}, found another size in {path.name}; remove it")
+        shape = image.shape
+        yield Frame(np.nan, image if image.dtype == np.uint8 else scale_to_eight_bits(image, bits))

@@ -1,34 +1,33 @@
-"""Which videos make up which recording."""
+"""Find the videos of each recording."""
 
 from pathlib import Path
 
 from rafl.calibration.rig import Rig
-from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, natural_key, open_video
-
 from rafl.common.errors import InputError
+from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, natural_key, open_video
 
 
 def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Video]]:
-    """Videos by recording and camera.
+    """Find the videos by recording and camera.
 
-    `<recording>/<camera>.<ext>`, `<recording>_<camera>.<ext>`, or `<recording>.<ext>` where the rig has
-    one camera; a folder of numbered pictures counts as a video, also when it is `videos` itself.
+    Their names are `<recording>/<camera>.<ext>`, `<recording>_<camera>.<ext>`, or `<recording>.<ext>` if the rig has
+    one camera. A folder of numbered images counts as a video, also if it is `videos` itself.
 
     Args:
         videos: folder, or a single video.
         rig: cameras to expect.
-        calib: the rig's file, for messages.
+        calib: file of the rig, for messages.
 
     Raises:
-        InputError: nothing found, a file that is no video, a video of a camera the rig lacks, a recording without one
-            of the rig's cameras, an unreadable video, or one of another size than its camera's.
+        InputError: no video is found, `videos` is not a video, a video's camera is not in the rig, a recording lacks a
+            camera of the rig, or a video is unreadable or differs in size from its camera.
     """
     if not videos.exists():
         raise InputError(f"expected videos at {videos}, found nothing there; check the path")
     if videos.is_file() and not is_video(videos):
         raise InputError(
             f"expected a folder of videos or a video ({', '.join(sorted(VIDEO_SUFFIXES))}) at {videos}, found "
-            "a file of another kind; check the path"
+            "another file type; check the path"
         )
     found: dict[str, dict[str, Path]] = {}
 
@@ -47,24 +46,25 @@ def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, 
             for part in sorted(path.iterdir(), key=natural_key):
                 if is_video(part):
                     name = part.name if part.is_dir() else part.stem
-                    _known(name, rig, calib, part)
+                    _check_camera(name, rig, calib, part)
                     add(path.name, name, part)
     if not found:
         raise InputError(f"expected videos in {videos}, found none; name them <recording>/<camera>.mp4")
     for recording, cameras in found.items():
-        absent = set(rig.cameras) - set(cameras)
-        if absent:
+        missing = set(rig.cameras) - set(cameras)
+        if missing:
             raise InputError(
                 f"recording {recording}: expected a video of every camera in {calib}, found none of "
-                f"{', '.join(sorted(absent))}; add it, or calibrate without that camera"
+                f"{', '.join(sorted(missing))}; add it, or calibrate without that camera"
             )
     return {
-        recording: {camera: _checked(path, rig, camera) for camera, path in cameras.items()}
+        recording: {camera: _open_checked(path, rig, camera) for camera, path in cameras.items()}
         for recording, cameras in found.items()
     }
 
 
 def _split_name(path: Path, rig: Rig, calib: Path) -> tuple[str, str]:
+    """Recording and camera in the name of a video."""
     stem = path.resolve().name if path.is_dir() else path.stem
     for camera in rig.cameras:
         if stem.endswith(f"_{camera}"):
@@ -72,11 +72,12 @@ def _split_name(path: Path, rig: Rig, calib: Path) -> tuple[str, str]:
     if len(rig.cameras) == 1:
         return stem, next(iter(rig.cameras))
     camera = stem.rpartition("_")[2]
-    _known(camera, rig, calib, path)
+    _check_camera(camera, rig, calib, path)
     return stem, camera
 
 
-def _known(camera: str, rig: Rig, calib: Path, path: Path) -> None:
+def _check_camera(camera: str, rig: Rig, calib: Path, path: Path) -> None:
+    """Refuse a camera that is not in the rig."""
     if camera not in rig.cameras:
         raise InputError(
             f"{path}: expected a video of one of the cameras in {calib} ({', '.join(rig.cameras)}), found "
@@ -84,7 +85,8 @@ def _known(camera: str, rig: Rig, calib: Path, path: Path) -> None:
         )
 
 
-def _checked(path: Path, rig: Rig, camera: str) -> Video:
+def _open_checked(path: Path, rig: Rig, camera: str) -> Video:
+    """Open a video and check its size."""
     video = open_video(path)
     expected = rig.cameras[camera].image_size
     if video.size != expected:

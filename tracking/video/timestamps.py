@@ -1,29 +1,41 @@
-"""One clock for all cameras of a recording."""
+"""Frame times, and one clock for all cameras of a recording."""
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rafl.calibration.rig import Rig
-from rafl.tracking.reconstruction.triangulation import CameraPixels, at_times, nearest_frames, triangulate
-from rafl.tracking.video.reader import Video
 from scipy.interpolate import CubicSpline
 from scipy.optimize import minimize_scalar
 
+from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
+from rafl.tracking.reconstruction.triangulation import CameraPixels, nearest_frames, resample_pixels, triangulate
+from rafl.tracking.video.reader import Video
 
 Array = NDArray[Any]
 
-LONGEST_DELAY = 12.0  # frames that cameras may have been started apart
-VALLEYS, AS_GOOD = 8, 4.0  # delays looked at closely; how much worse than the best may still be the true one
-FEWEST_COMMON = 3  # markers that two cameras must share to be synchronised by position
+MAX_DELAY_FRAMES = 12.0  # between the starts of two cameras
+# The delay with the lowest cost is searched around the MAX_MINIMA lowest samples. The true one may cost up to
+# ACCEPTED_COST_RATIO times the lowest.
+MAX_MINIMA, ACCEPTED_COST_RATIO = 8, 4.0
+MIN_COMMON_MARKERS = 3  # that two cameras must share to be synchronised by reprojection
+# At a tried delay both cameras must have this many marker observations at the same times (frames, without shared
+# markers). Otherwise its cost is infinite.
+MIN_COMMON_OBSERVATIONS = 20
 
 
 def camera_times(times: dict[str, Array], videos: dict[str, Video], fps: float | None) -> dict[str, Array]:
-    """The time of every frame by camera [s]: `fps` where given, else the videos' own stamps.
+    """Time of every frame by camera [s], from `fps` if given, else from the timestamps.
+
+    Args:
+        times: timestamps by camera [s], (T).
+        videos: by camera, for messages.
+        fps: frame rate [1/s], or None.
 
     Raises:
-        InputError: fewer than two frames, or stamps that do not rise.
+        InputError: a video has fewer than two frames, no timestamps or some that do not increase, or frame rates
+            differ.
     """
     result = {}
     for camera, time in times.items():
@@ -34,12 +46,12 @@ def camera_times(times: dict[str, Array], videos: dict[str, Video], fps: float |
             result[camera] = np.arange(len(time)) / fps
             continue
         if path.is_dir():
-            raise InputError(f"{path}: a folder of pictures has no times; give the true rate with --fps")
+            raise InputError(f"{path}: a folder of images has no times; give the true frame rate with --fps")
         if not np.isfinite(time).all() or (np.diff(time) <= 0).any():
             frame = int(np.argmax(~np.isfinite(time) | np.r_[False, np.diff(time) <= 0]))
             raise InputError(
-                f"{path}: expected a later time with every frame, found {1e3 * time[frame]:.6g} ms at frame {frame}; "
-                "give the true rate with --fps"
+                f"{path}: expected timestamps that increase with every frame, found {1e3 * time[frame]:.6g} ms at "
+                f"frame {frame}; give the true frame rate with --fps"
             )
         result[camera] = time
     rates = {camera: 1.0 / float(np.median(np.diff(time))) for camera, time in result.items()}
@@ -48,13 +60,16 @@ def camera_times(times: dict[str, Array], videos: dict[str, Video], fps: float |
         if abs(other / rate - 1.0) > 0.02:
             raise InputError(
                 f"{videos[camera].path}: expected {rate:.6g} frames/s as in camera {first}, found {other:.6g}; record "
-                "all cameras at one rate, or give the true rate with --fps"
+                "all cameras at one frame rate, or give the true one with --fps"
             )
     return result
 
 
 def common_clock(times: dict[str, Array]) -> Array:
-    """Times at which the recording is reconstructed [s], (T): the first camera's, and others' that it dropped."""
+    """Times at which the recording is reconstructed [s], (T).
+
+    These are the times of the first camera, and those of other cameras at which it dropped frames.
+    """
     clock = next(iter(times.values()))
     step = float(np.median(np.diff(clock)))
     for time in times.values():
@@ -64,57 +79,74 @@ def common_clock(times: dict[str, Array]) -> Array:
     return clock
 
 
-def delays(rig: Rig, pixels: dict[str, CameraPixels], times: dict[str, Array]) -> dict[str, float]:
-    """By how much each camera's clock runs ahead of the first's [s], from the motion.
+def estimate_clock_delays(rig: Rig, pixels: dict[str, CameraPixels], times: dict[str, Array]) -> dict[str, float]:
+    """Offset of each camera's clock from the first camera's [s], estimated from the motion; positive if it is ahead.
 
-    Two cameras that see the same markers agree on their places only where their clocks do. Cameras that
-    share no marker must at least see the body move alike.
+    If two cameras share markers, their reprojection residual is lowest at the true delay. Otherwise the motion of the
+    markers that one camera sees must be explained by the motion that the other sees.
+
+    Args:
+        rig: the cameras.
+        pixels: markers by camera.
+        times: of the frames by camera [s], (T).
 
     Raises:
-        InputError: too little motion to tell.
+        InputError: there is too little motion.
     """
     names = list(pixels)
     first = names[0]
     result = {first: 0.0}
     step = float(np.median(np.diff(times[first])))
     for other in names[1:]:
-        both = np.isfinite(pixels[first].sigma[..., 0]).any(0) & np.isfinite(pixels[other].sigma[..., 0]).any(0)
-        if both.sum() >= FEWEST_COMMON:
-            cost = _disagreement(rig, pixels, times, first, other, both)
+        seen = [np.isfinite(pixels[camera].sigma[..., 0]).any(0) for camera in (first, other)]
+        both: NDArray[np.bool_] = np.asarray(seen[0] & seen[1])
+        if both.sum() >= MIN_COMMON_MARKERS:
+            cost = _reprojection_cost(rig, pixels, times, first, other, both)
         else:
-            cost = _unlikeness(pixels, times, first, other)
-        tried = step * np.arange(-LONGEST_DELAY, LONGEST_DELAY + 0.25, 0.5)
-        costs = np.array([cost(delay) for delay in tried])
+            cost = _motion_cost(pixels, times, first, other)
+        samples = step * np.arange(-MAX_DELAY_FRAMES, MAX_DELAY_FRAMES + 0.25, 0.5)
+        costs = np.array([cost(delay) for delay in samples])
         if not np.isfinite(costs).any() or np.nanmin(costs) > 0.7 * np.nanmedian(costs):
             raise InputError(
-                f"camera {other}: expected motion that shows how its clock stands against camera {first}'s, found "
-                "too little; film a livelier motion, or leave out --sync and set time_offset_s in calib.yaml"
+                f"camera {other}: expected motion that shows the delay to camera {first}, found too little; record "
+                "a livelier motion, or leave out --sync and set time_offset_s in calib.yaml"
             )
-        valleys = [
+        minima = [
             minimize_scalar(cost, bounds=(start - 0.5 * step, start + 0.5 * step), method="bounded")
-            for start in tried[np.argsort(costs)[:VALLEYS]]
+            for start in samples[np.argsort(costs)[:MAX_MINIMA]]
         ]
-        # A swing looks much the same one period on: of delays as good, the shortest.
-        best = min(valley.fun for valley in valleys)
-        result[other] = min((float(valley.x) for valley in valleys if valley.fun < AS_GOOD * best + 1e-9), key=abs)
+        # An oscillation repeats after one period; of the delays with an accepted cost the shortest is taken.
+        accepted_cost = ACCEPTED_COST_RATIO * min(minimum.fun for minimum in minima) + 1e-9
+        result[other] = min((float(minimum.x) for minimum in minima if minimum.fun < accepted_cost), key=abs)
     return result
 
 
-def _disagreement(rig, pixels, times, first, other, both):
-    """Root mean square reprojection residual [px] as a function of the other camera's delay [s]."""
-    mine = CameraPixels(pixels[first].pixel[:, both], pixels[first].sigma[:, both])
-    theirs = CameraPixels(pixels[other].pixel[:, both], pixels[other].sigma[:, both])
+def _reprojection_cost(
+    rig: Rig,
+    pixels: dict[str, CameraPixels],
+    times: dict[str, Array],
+    first: str,
+    other: str,
+    both: NDArray[np.bool_],
+) -> Callable[[float], float]:
+    """Root mean square reprojection residual [px] as a function of the other camera's delay [s].
+
+    `both` selects the markers that both cameras see, (M).
+    """
+    reference = CameraPixels(pixels[first].pixel[:, both], pixels[first].sigma[:, both])
+    delayed = CameraPixels(pixels[other].pixel[:, both], pixels[other].sigma[:, both])
     pair = Rig({name: rig.cameras[name] for name in (first, other)})
 
     def cost(delay: float) -> float:
-        shifted = at_times(theirs, times[other] - delay, times[first])
-        seen = np.isfinite(mine.sigma[..., 0]) & np.isfinite(shifted.sigma[..., 0])
-        if seen.sum() < 20:
+        shifted = resample_pixels(delayed, times[other] - delay, times[first])
+        seen = np.isfinite(reference.sigma[..., 0]) & np.isfinite(shifted.sigma[..., 0])
+        if seen.sum() < MIN_COMMON_OBSERVATIONS:
             return np.inf
-        even = np.where(seen[..., None], 1.0, np.nan)
-        # Judged by the robust mean of residuals without leaving any out.
+        uniform = np.where(seen[..., None], 1.0, np.nan)
+        # The large sigma keeps all residuals; each counts with at most 50 px.
         found = triangulate(
-            pair, {first: CameraPixels(mine.pixel, even * 50.0), other: CameraPixels(shifted.pixel, even * 50.0)}
+            pair,
+            {first: CameraPixels(reference.pixel, uniform * 50.0), other: CameraPixels(shifted.pixel, uniform * 50.0)},
         )
         residual = np.concatenate([values[seen] for values in found[2].values()])
         return float(np.sqrt(np.mean(np.minimum(residual, 50.0) ** 2)))
@@ -122,24 +154,28 @@ def _disagreement(rig, pixels, times, first, other, both):
     return cost
 
 
-def _unlikeness(pixels, times, first, other):
-    """The share of one view's motion that the other's does not explain, as a function of the delay [s]."""
+def _motion_cost(
+    pixels: dict[str, CameraPixels], times: dict[str, Array], first: str, other: str
+) -> Callable[[float], float]:
+    """Share of one camera's motion that the other's does not explain, as a function of the delay [s]."""
 
-    def motion(item: CameraPixels, modes: int) -> Array:
-        whole = np.isfinite(item.sigma[..., 0]).mean(axis=0) > 0.9
-        path = item.pixel[:, whole].reshape(len(item.pixel), -1)
+    def principal_motion(item: CameraPixels, modes: int) -> Array:
+        complete = np.isfinite(item.sigma[..., 0]).mean(axis=0) > 0.9
+        path = item.pixel[:, complete].reshape(len(item.pixel), -1)
         path = np.where(np.isfinite(path), path - np.nanmean(path, axis=0), 0.0)
         left, size, _ = np.linalg.svd(path, full_matrices=False)
-        return left[:, :modes] * size[:modes]
+        scores: Array = left[:, :modes] * size[:modes]
+        return scores
 
-    mine, theirs = motion(pixels[first], 1), CubicSpline(times[other], motion(pixels[other], 3))
+    reference = principal_motion(pixels[first], 1)
+    delayed = CubicSpline(times[other], principal_motion(pixels[other], 3))
 
     def cost(delay: float) -> float:
-        asked = times[first] + delay
-        inside = (asked >= times[other][0]) & (asked <= times[other][-1])
-        if inside.sum() < 20:
+        time = times[first] + delay
+        inside = (time >= times[other][0]) & (time <= times[other][-1])
+        if inside.sum() < MIN_COMMON_OBSERVATIONS:
             return np.inf
-        a, b = mine[inside] - mine[inside].mean(axis=0), theirs(asked[inside])
+        a, b = reference[inside] - reference[inside].mean(axis=0), delayed(time[inside])
         basis = np.linalg.qr(b - b.mean(axis=0))[0]
         return float(1.0 - ((basis.T @ a) ** 2).sum() / ((a**2).sum() + 1e-12))
 

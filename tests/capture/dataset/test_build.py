@@ -5,27 +5,27 @@ import ezc3d
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
+
 from rafl.capture.dataset.build import CaptureSettings, build_dataset
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
 from rafl.capture.registration.registration import RestPose
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.capture.specimen.specimen import Specimen
-from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
-from scipy.spatial.transform import Rotation
-
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.synthetic import load_force
+from rafl.tracking.linking.layout import MarkerLayout
+from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 
-SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0)
+SETTINGS = CaptureSettings()
 FRAMES = 8
-LAB = (Rotation.from_rotvec([0.3, -0.8, 1.2]).as_matrix(), np.array([0.4, -0.1, 1.5]))
+LAB_POSE = (Rotation.from_rotvec([0.3, -0.8, 1.2]).as_matrix(), np.array([0.4, -0.1, 1.5]))
 
 
 @pytest.fixture(scope="module")
 def truth(small_specimen: Specimen) -> np.ndarray:
-    """Markers of a release under 60 g, (T, M, 3), and the undeformed ones before them in row 0."""
+    """Undeformed marker positions in row 0, followed by those after the release of 60 g [m], (1 + T, M, 3)."""
     motion = tip_load_release(small_specimen, small_specimen.material, 0.06, FRAMES, 100.0)
     markers = small_specimen.markers(1e-6)
     moving = markers.positions(torch.from_numpy(motion.q)).numpy()
@@ -37,8 +37,8 @@ def build(specimen: Specimen, folder: Path, settings: CaptureSettings = SETTINGS
     return build_dataset(specimen, folder, rows, settings, "", lambda: None)
 
 
-def in_the_lab(points: np.ndarray) -> np.ndarray:
-    return points @ LAB[0].T + LAB[1]
+def in_lab_frame(points: np.ndarray) -> np.ndarray:
+    return points @ LAB_POSE[0].T + LAB_POSE[1]
 
 
 def write_c3d(path: Path, names: list[str], points: np.ndarray) -> None:
@@ -52,111 +52,109 @@ def write_c3d(path: Path, names: list[str], points: np.ndarray) -> None:
     file.write(str(path))
 
 
-def test_the_authors_arrays_are_registered_by_their_rest_row(
+def test_npy_files_are_registered_by_their_rest_row(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
-    np.save(tmp_path / "q0.npy", 1e3 * in_the_lab(truth))
+    np.save(tmp_path / "q0.npy", 1e3 * in_lab_frame(truth))
     built = build(small_specimen, tmp_path)
     item = built.trajectories["q0"]
     np.testing.assert_allclose(item.markers, truth[1:], atol=1e-9)
     np.testing.assert_allclose(item.time, 0.01 * np.arange(FRAMES))
     assert item.attributes["registration_residual_mm"] < 1e-6
     assert item.attributes["fit_residual_mm"] < 0.1
-    # The virtual force is the load: 60 g.
+    # The virtual force equals the load of 60 g.
     load = load_force(built.simulator, small_specimen.loaded, 0.06)
     np.testing.assert_allclose(item.virtual_force.sum(0), load.sum(0), atol=0.03)
 
 
 def with_clamp(specimen: Specimen) -> Specimen:
-    places = np.array([[-0.01, -0.02, 0.0], [-0.01, 0.04, 0.0], [-0.01, 0.01, 0.05], [-0.02, 0.0, 0.0]])
-    return replace(specimen, clamp_layout=MarkerLayout(("C1", "C2", "C3", "C4"), places))
+    positions = np.array([[-0.01, -0.02, 0.0], [-0.01, 0.04, 0.0], [-0.01, 0.01, 0.05], [-0.02, 0.0, 0.0]])
+    return replace(specimen, clamp_layout=MarkerLayout(("C1", "C2", "C3", "C4"), positions))
 
 
-def test_motion_capture_in_the_frame_of_a_moving_clamp(
+def test_motion_capture_is_registered_to_a_moving_clamp(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
-    """The clamp shakes by a millimetre and a degree; in its frame the markers move as if it did not.
-
-    One of its markers is never seen."""
+    """The clamp shakes by 1 mm and 1 degree, which the registration removes. One clamp marker is always missing."""
     specimen = with_clamp(small_specimen)
     random = np.random.default_rng(5)
     points = np.concatenate([truth[1:], np.broadcast_to(specimen.clamp_layout.positions, (FRAMES, 4, 3))], axis=1)
     turns = Rotation.from_rotvec(random.normal(0, np.radians(1), (FRAMES, 3))).as_matrix()
     shaken = np.einsum("tij,tmj->tmi", turns, points) + random.normal(0, 1e-3, (FRAMES, 1, 3))
     shaken[:, -1] = np.nan
-    write_c3d(tmp_path / "q0.c3d", [*specimen.layout.names, *specimen.clamp_layout.names], in_the_lab(shaken))
+    write_c3d(tmp_path / "q0.c3d", [*specimen.layout.names, *specimen.clamp_layout.names], in_lab_frame(shaken))
     item = build(specimen, tmp_path).trajectories["q0"]
     assert [text.split()[0] for text in str(item.attributes["registration_markers"]).split(", ")] == ["C1", "C2", "C3"]
     assert item.attributes["registration_residual_mm"] < 1e-3
     np.testing.assert_allclose(item.markers, truth[1:], atol=1e-6)  # C3D holds single precision
-    still = build(specimen, tmp_path, replace(SETTINGS, moving_clamp=False)).trajectories["q0"]
-    assert np.abs(still.markers - truth[1:]).max() > 5e-4
+    unregistered = build(specimen, tmp_path, replace(SETTINGS, moving_clamp=False)).trajectories["q0"]
+    assert np.abs(unregistered.markers - truth[1:]).max() > 5e-4
 
 
 def test_a_rest_pose_registers_files_without_a_clamp(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
-    """From a recording of its own or some of its frames, averaged."""
+    """The rest pose is the mean over 30 frames of a separate recording; it is better than one frame."""
     names, random = list(small_specimen.layout.names), np.random.default_rng(2)
-    write_c3d(tmp_path / "q0.c3d", names, in_the_lab(truth[1:]))
+    write_c3d(tmp_path / "q0.c3d", names, in_lab_frame(truth[1:]))
     straight = np.broadcast_to(truth[:1], (30, *truth.shape[1:])) + random.normal(0, 1e-4, (30, *truth.shape[1:]))
-    write_c3d(tmp_path / "straight.c3d", names, in_the_lab(np.concatenate([truth[5:], straight])))
-    many = build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("straight", 4, 33))).trajectories["q0"]
-    one = build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("straight", 4, 4))).trajectories["q0"]
-    off = [np.abs(item.markers - truth[1:]).max() for item in (many, one)]
-    assert off[0] < 3e-5
-    assert off[0] < 0.5 * off[1]
-    assert many.attributes["registration"] == "rest pose"
-    spread = np.sqrt(np.diag(np.asarray(many.attributes["registration_covariance"])))
-    assert spread[3:].max() < 2e-4
+    write_c3d(tmp_path / "straight.c3d", names, in_lab_frame(np.concatenate([truth[5:], straight])))
+    averaged = build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("straight", 4, 33))).trajectories["q0"]
+    single = build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("straight", 4, 4))).trajectories["q0"]
+    errors = [np.abs(item.markers - truth[1:]).max() for item in (averaged, single)]
+    assert errors[0] < 3e-5
+    assert errors[0] < 0.5 * errors[1]
+    assert averaged.attributes["registration"] == "rest pose"
+    sigma = np.sqrt(np.diag(np.asarray(averaged.attributes["registration_covariance"])))
+    assert sigma[3:].max() < 2e-4
     with pytest.raises(InputError, match="frames within 0 to 33"):
         build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("straight", 4, 34)))
     with pytest.raises(InputError, match=r"recording nowhere.*nowhere\.h5"):
         build(small_specimen, tmp_path, replace(SETTINGS, rest=RestPose("nowhere")))
 
 
-def test_without_a_rest_pose_the_model_finds_the_frame(
+def test_without_a_rest_pose_the_pose_is_fitted_with_the_model(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
-    """The first frame is bent by 60 g and nobody says how the lab's axes lie."""
-    write_c3d(tmp_path / "q0.c3d", list(small_specimen.layout.names), in_the_lab(truth[1:]))
+    """The first frame is bent by 60 g, and the pose of the lab frame is unknown."""
+    write_c3d(tmp_path / "q0.c3d", list(small_specimen.layout.names), in_lab_frame(truth[1:]))
     item = build(small_specimen, tmp_path).trajectories["q0"]
     assert str(item.attributes["registration"]).startswith("through the model")
     assert np.abs(item.markers - truth[1:]).max() < 5e-4
     assert item.attributes["fit_residual_mm"] < 0.05
 
 
-def test_a_wrong_marker_is_set_aside_by_name(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
-    off = truth.copy()
-    off[:, 6] += [0.0, 0.004, 0.003]
-    np.save(tmp_path / "q0.npy", 1e3 * in_the_lab(off))
+def test_an_outlier_is_left_out_and_named(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    recorded = truth.copy()
+    recorded[:, 6] += [0.0, 0.004, 0.003]
+    np.save(tmp_path / "q0.npy", 1e3 * in_lab_frame(recorded))
     item = build(small_specimen, tmp_path).trajectories["q0"]
     assert item.attributes["set_aside"] == small_specimen.layout.names[6]
     assert not item.valid[:, 6].any()
-    seen = np.arange(20) != 6
-    np.testing.assert_allclose(item.markers[:, seen], truth[1:, seen], atol=1e-9)
+    others = np.arange(20) != 6
+    np.testing.assert_allclose(item.markers[:, others], truth[1:, others], atol=1e-9)
 
 
-def test_the_rest_before_the_release_is_averaged(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
-    """Twenty frames held still, with noise: the first frame's shape is better known than by one of them."""
+def test_frames_at_rest_are_averaged(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    """The mean of 20 noisy frames at rest gives a more accurate first frame than one of them."""
     random = np.random.default_rng(4)
-    held = np.repeat(truth[1:2], 20, axis=0)
-    recorded = np.concatenate([truth[:1], held, truth[2:]])
+    at_rest = np.repeat(truth[1:2], 20, axis=0)
+    recorded = np.concatenate([truth[:1], at_rest, truth[2:]])
     recorded[1:] += random.normal(0, 5e-5, recorded[1:].shape)
     np.save(tmp_path / "q0.npy", 1e3 * recorded)
-    found = build(small_specimen, tmp_path)
-    item = found.trajectories["q0"]
+    dataset = build(small_specimen, tmp_path)
+    item = dataset.trajectories["q0"]
     assert (item.attributes["first_frame"], item.attributes["first_frame_from"]) == (19, "the motion")
     assert int(str(item.attributes["still_frames"])) >= 15
     assert len(item.time) == FRAMES
-    exact = found.markers.positions(torch.from_numpy(item.q)).numpy()
-    assert np.sqrt(((exact - truth[1]) ** 2).mean()) < 2.5e-5
+    fitted = dataset.markers.positions(torch.from_numpy(item.q)).numpy()
+    assert np.sqrt(((fitted - truth[1]) ** 2).mean()) < 2.5e-5
     given = build(small_specimen, tmp_path, replace(SETTINGS, start=21)).trajectories["q0"]
     assert (given.attributes["first_frame"], len(given.time)) == (21, FRAMES - 2)
 
 
 def test_a_recording_that_starts_in_motion(small_specimen: Specimen, tmp_path: Path) -> None:
-    """Positions and velocities of all vertices, from markers alone, in the midst of a swing."""
+    """Positions and velocities of all nodes in the middle of a swing are fitted to the markers."""
     fine = tip_load_release(small_specimen, small_specimen.material, 0.06, 300, 1000.0).q
     markers = small_specimen.markers(1e-6).positions(torch.from_numpy(fine[::10])).numpy()
     np.save(tmp_path / "q0.npy", 1e3 * np.concatenate([small_specimen.layout.positions[None], markers]))
@@ -169,8 +167,8 @@ def test_a_recording_that_starts_in_motion(small_specimen: Specimen, tmp_path: P
     assert np.abs(at_rest.v).max() == 0.0
 
 
-def track(specimen: Specimen, folder: Path, position: np.ndarray, sigma: np.ndarray) -> None:
-    """Write q0.h5, every marker seen."""
+def write_q0_tracks(specimen: Specimen, folder: Path, position: np.ndarray, sigma: np.ndarray) -> None:
+    """Write q0.h5 with every marker measured."""
     time, state = 0.01 * np.arange(FRAMES), np.ones(position.shape[:2], dtype=np.uint8)
     tracks = Tracks(
         specimen.layout.names,
@@ -192,23 +190,23 @@ def track(specimen: Specimen, folder: Path, position: np.ndarray, sigma: np.ndar
     write_tracks(folder / "q0.h5", tracks)
 
 
-def test_tracks_are_taken_as_they_are_unless_they_cannot_be(
+def test_tracks_need_no_registration_but_must_be_in_the_specimen_frame(
     small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
 ) -> None:
-    """The calibration's world is the specimen's frame; 20 mm off, no bending explains the markers."""
+    """Tracks are in the specimen frame already; a shift of 20 mm is refused, because no bending explains it."""
     moving, sigma = truth[1:], np.full_like(truth[1:], 1e-5)
-    track(small_specimen, tmp_path, moving, sigma)
+    write_q0_tracks(small_specimen, tmp_path, moving, sigma)
     item = build(small_specimen, tmp_path).trajectories["q0"]
     np.testing.assert_array_equal(item.markers, moving)
-    track(small_specimen, tmp_path, moving + np.array([0.0, 0.02, 0.0]), sigma)
+    write_q0_tracks(small_specimen, tmp_path, moving + np.array([0.0, 0.02, 0.0]), sigma)
     with pytest.raises(InputError, match="world is the specimen's frame"):
         build(small_specimen, tmp_path)
 
 
-def test_gaps_and_chosen_frames(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
-    lost = in_the_lab(truth)
-    lost[4, 2:5] = np.nan
-    np.save(tmp_path / "q0.npy", 1e3 * lost)
+def test_frames_are_selected_and_gaps_kept(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    recorded = in_lab_frame(truth)
+    recorded[4, 2:5] = np.nan
+    np.save(tmp_path / "q0.npy", 1e3 * recorded)
     item = build(small_specimen, tmp_path, first_frame=1, last_frame=6).trajectories["q0"]
     assert len(item.time) == 6
     assert item.time[0] == 0.0
@@ -216,7 +214,7 @@ def test_gaps_and_chosen_frames(small_specimen: Specimen, truth: np.ndarray, tmp
     assert item.valid.sum() == 6 * 20 - 3
 
 
-def test_a_hanging_load_stays_as_force_and_mass(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+def test_a_hanging_load_is_kept_as_force_and_mass(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
     np.save(tmp_path / "q0.npy", 1e3 * truth)
     item = build(small_specimen, tmp_path, load="hanging").trajectories["q0"]
     assert item.added_mass.sum() == pytest.approx(0.06)
@@ -226,7 +224,7 @@ def test_a_hanging_load_stays_as_force_and_mass(small_specimen: Specimen, truth:
     assert np.abs(released.load).sum() == 0.0
 
 
-def test_what_does_not_fit_is_refused(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+def test_invalid_files_and_frames_are_refused(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
     path = tmp_path / "q0.npy"
     for content, message in (
         (1e3 * truth[:, :-1], "expected 20 markers .* found 19"),
@@ -258,8 +256,8 @@ def test_what_does_not_fit_is_refused(small_specimen: Specimen, truth: np.ndarra
         ("recording,load_g,split\na,50,test\n", "split `train`"),
         ("recording,load_g,split\n\na,50,train\n,,\nb,heavy,test\n", "line 5, column load_g"),
         ("recording,load_g,split\na,60,5,train\n", "line 2: expected 3 cells"),
-        ('recording,load_g,split\na,"1,234",train\n', "line 2, column load_g"),  # a thousand, or one?
-        ("recording,load_g,split\na,50,train\na,60,test\n", "a stands there twice"),
+        ('recording,load_g,split\na,"1,234",train\n', "line 2, column load_g"),  # ambiguous: a thousand, or one
+        ("recording,load_g,split\na,50,train\na,60,test\n", "found a twice"),
         ("", "save it as CSV"),
     ],
 )
@@ -270,7 +268,7 @@ def test_bad_tables_name_line_and_column(tmp_path: Path, text: str, message: str
         read_recording_rows(path)
 
 
-def test_spreadsheet_habits_are_read(tmp_path: Path) -> None:
+def test_spreadsheet_quirks_are_accepted(tmp_path: Path) -> None:
     """A byte-order mark, spaces after commas, empty optional cells and empty cells beyond the last column."""
     path = tmp_path / "recordings.csv"
     path.write_bytes(b"\xef\xbb\xbfrecording, load_g, split, first_frame\r\na, 50, train,,\r\nb, 60, test, 3\r\n")
@@ -287,16 +285,16 @@ def test_tables_with_other_separators_and_decimal_commas_are_read(separator: str
     assert [(row.recording, row.load_g, row.first_frame) for row in rows] == [("a", 60.5, None), ("b", 70, 3)]
 
 
-def test_a_table_in_another_encoding_is_refused_in_words(tmp_path: Path) -> None:
+def test_a_table_in_another_encoding_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "recordings.csv"
     path.write_text("recording,load_g,split\nMärz,50,train\n", encoding="utf-16")
     with pytest.raises(InputError, match="save it as CSV UTF-8"):
         read_recording_rows(path)
 
 
-def test_a_sigma_of_zero_is_refused_in_words(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+def test_a_sigma_of_zero_is_refused(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
     sigma = np.full_like(truth[1:], 1e-5)
     sigma[4, 2] = 0.0
-    track(small_specimen, tmp_path, truth[1:], sigma)
+    write_q0_tracks(small_specimen, tmp_path, truth[1:], sigma)
     with pytest.raises(InputError, match=r"trajectories/q0/sigma: expected more than 0"):
         build(small_specimen, tmp_path)

@@ -1,14 +1,14 @@
-"""Specimens of any shape, as hexahedra."""
+"""Hexahedral meshes of specimens of different shapes."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
-from rafl.capture.specimen.geometry import Geometry, fill, read_surface
-from rafl.capture.specimen.specimen import read_specimen
 from support import ROOT
 
+from rafl.capture.specimen.geometry import Geometry, fill_surface, read_surface
+from rafl.capture.specimen.specimen import read_specimen
 from rafl.common.errors import InputError
 from rafl.fem.mesh import HexMesh
 
@@ -40,32 +40,32 @@ def box(size: tuple[float, float, float], corner: tuple[float, float, float] = (
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_the_papers_shapes(name: str) -> None:
+def test_shapes_match_the_paper(name: str) -> None:
     specimen = read_specimen(SPECIMENS / f"{name}.yaml")
     mesh = specimen.mesh
     assert (len(mesh.vertices), len(mesh.hexes), len(specimen.fixed), len(specimen.loaded)) == COUNTS[name]
     assert mesh.volumes.sum() == pytest.approx(specimen.volume)
-    specimen.markers(1e-6)  # all dots lie on the skin
+    specimen.markers(1e-6)  # raises unless all markers are on the surface
 
 
 @pytest.mark.parametrize("suffix", ["stl", "obj", "ply"])
-def test_a_surface_of_a_box_is_the_box(tmp_path: Path, suffix: str) -> None:
-    solid = fill(saved(tmp_path, box((100, 30, 30)), f"beam.{suffix}"), 0.01, "x-min")
+def test_filling_the_surface_of_a_box_gives_the_box_mesh(tmp_path: Path, suffix: str) -> None:
+    solid = fill_surface(saved(tmp_path, box((100, 30, 30)), f"beam.{suffix}"), 0.01, "x-min")
     expected = HexMesh.box((10, 3, 3), (0.1, 0.03, 0.03))
     np.testing.assert_allclose(solid.mesh.vertices, expected.vertices, atol=1e-9)
     np.testing.assert_array_equal(solid.mesh.hexes, expected.hexes)
     assert solid.volume == pytest.approx(9e-5)
 
 
-def test_a_surface_keeps_its_place_and_its_volume(tmp_path: Path) -> None:
-    """A cylinder along x, somewhere in space, its ends at the ends of the cells; finer elements, nearer volume."""
+def test_filling_a_surface_keeps_its_position_and_volume(tmp_path: Path) -> None:
+    """A shifted cylinder along x; its ends lie on cell faces, and finer elements come within 2 % of its volume."""
     shape = trimesh.creation.cylinder(15.0, 60.0, sections=96)
     shape.apply_transform(trimesh.geometry.align_vectors([0, 0, 1], [1, 0, 0]))
     shape.apply_translation([40.0, -20.0, 7.0])
     path = saved(tmp_path, shape)
     gaps = []
     for element in (0.006, 0.003, 0.0015):
-        mesh, volume = (solid := fill(path, element, "x-max")).mesh, solid.volume
+        mesh, volume = (solid := fill_surface(path, element, "x-max")).mesh, solid.volume
         assert volume == pytest.approx(np.pi * 0.015**2 * 0.06, rel=2e-3)
         np.testing.assert_allclose(mesh.vertices[:, 0].min(), 0.010, atol=1e-9)
         np.testing.assert_allclose(mesh.vertices[:, 0].max(), 0.070, atol=1e-9)
@@ -76,33 +76,33 @@ def test_a_surface_keeps_its_place_and_its_volume(tmp_path: Path) -> None:
     assert gaps[-1] < 0.02
 
 
-def test_cells_begin_at_the_clamp(tmp_path: Path) -> None:
-    """Of 25 mm only two cells of 10 mm and one of half have their centres inside; the rest is at the far end."""
+def test_cells_start_at_the_clamp(tmp_path: Path) -> None:
+    """In 24 mm two cells of 10 mm have their centres inside; the remainder is at the free end."""
     path = saved(tmp_path, box((24, 20, 20)))
     for face, low in (("x-min", 0.0), ("x-max", 0.004)):
-        mesh = fill(path, 0.01, face).mesh
+        mesh = fill_surface(path, 0.01, face).mesh
         assert mesh.vertices[:, 0].min() == pytest.approx(low, abs=1e-9)
         assert np.ptp(mesh.vertices[:, 0]) == pytest.approx(0.02)
 
 
-def test_a_surface_turned_inside_out_is_turned_back(tmp_path: Path) -> None:
+def test_an_inside_out_surface_is_repaired(tmp_path: Path) -> None:
     shape = box((30, 20, 20))
     shape.invert()
-    assert len(fill(saved(tmp_path, shape), 0.01, "x-min").mesh.hexes) == 12
+    assert len(fill_surface(saved(tmp_path, shape), 0.01, "x-min").mesh.hexes) == 12
 
 
-def test_what_cannot_be_filled_is_refused(tmp_path: Path) -> None:
+def test_invalid_surfaces_are_refused(tmp_path: Path) -> None:
     open_shape = box((30, 20, 20))
     open_shape.update_faces(np.arange(len(open_shape.faces)) > 1)
     with pytest.raises(InputError, match=r"watertight.*found [45] of"):
         read_surface(saved(tmp_path, open_shape, "open.stl"))
     with pytest.raises(InputError, match=r"expected elements inside it.*100 mm"):
-        fill(saved(tmp_path, trimesh.creation.torus(30, 5), "ring.stl"), 0.1, "x-min")
+        fill_surface(saved(tmp_path, trimesh.creation.torus(30, 5), "ring.stl"), 0.1, "x-min")
     two = trimesh.util.concatenate([box((20, 20, 20)), box((20, 20, 20), (60, 0, 0))])
     with pytest.raises(InputError, match="2 pieces"):
-        fill(saved(tmp_path, two, "two.stl"), 0.01, "x-min")
+        fill_surface(saved(tmp_path, two, "two.stl"), 0.01, "x-min")
     with pytest.raises(InputError, match="is the file in mm"):
-        fill(saved(tmp_path, box((3000, 3000, 3000)), "huge.stl"), 0.01, "x-min")
+        fill_surface(saved(tmp_path, box((3000, 3000, 3000)), "huge.stl"), 0.01, "x-min")
     (tmp_path / "bad.stl").write_bytes(b"solid nothing\nendsolid")
     (tmp_path / "bad.obj").write_bytes(bytes(range(256)))
     (tmp_path / "bad.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex x")
@@ -119,12 +119,12 @@ def test_what_cannot_be_filled_is_refused(tmp_path: Path) -> None:
         ({"box_mm": [10, 10, 10], "rectangles": [[1, 1]], "element_mm": 1}, "one of box_mm"),
         ({"box_mm": [10, 10, 10]}, "element_mm"),
         ({"surface": "a.stl", "cells": [1, 1, 1]}, "cells"),
-        ({"box_mm": [10, 10, 10], "element_mm": 5, "cells": [2, 2, 2]}, "in the place of element_mm"),
+        ({"box_mm": [10, 10, 10], "element_mm": 5, "cells": [2, 2, 2]}, "instead of element_mm"),
         ({"box_mm": [10, 10, 0], "element_mm": 5}, "longer than 0"),
-        ({"ellipses": [[1, -1]], "element_mm": 5}, "wider and higher"),
-        ({"rectangles": [[0, 1]], "element_mm": 5}, "wider and higher"),
+        ({"ellipses": [[1, -1]], "element_mm": 5}, "a width and a height"),
+        ({"rectangles": [[0, 1]], "element_mm": 5}, "a width and a height"),
     ],
 )
-def test_a_geometry_that_makes_no_sense_is_refused(geometry: dict, message: str) -> None:
+def test_invalid_geometries_are_refused(geometry: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         Geometry.model_validate(geometry)

@@ -1,4 +1,4 @@
-"""Making things ahead, in a thread of its own."""
+"""Prefetching in a thread."""
 
 import threading
 import time
@@ -6,21 +6,22 @@ from collections.abc import Generator
 from contextlib import closing
 
 import pytest
-from rafl.tracking.video.prefetch import AHEAD, ahead
+
+from rafl.tracking.video.prefetch import MAX_PREFETCH_BYTES, prefetch
 
 
 class Source:
-    """Counts, and says how far it has come and whether it was closed."""
+    """Yields numbers, and records how many and whether it was closed."""
 
     def __init__(self, count: int, fails: bool = False) -> None:
-        self.made = 0
+        self.produced = 0
         self.closed = threading.Event()
         self.count, self.fails = count, fails
 
     def numbers(self) -> Generator[int]:
         try:
             for number in range(self.count):
-                self.made = number + 1
+                self.produced = number + 1
                 yield number
             if self.fails:
                 raise OSError("the disk is gone")
@@ -28,32 +29,32 @@ class Source:
             self.closed.set()
 
 
-def test_all_things_in_order_and_then_the_error() -> None:
-    assert list(ahead(Source(1000).numbers(), lambda _: 1)) == list(range(1000))
-    things = ahead(Source(7, fails=True).numbers(), lambda _: 1)
-    assert [next(things) for _ in range(7)] == list(range(7))
+def test_items_come_in_order_and_then_the_error() -> None:
+    assert list(prefetch(Source(1000).numbers(), lambda _: 1)) == list(range(1000))
+    items = prefetch(Source(7, fails=True).numbers(), lambda _: 1)
+    assert [next(items) for _ in range(7)] == list(range(7))
     with pytest.raises(OSError, match="the disk is gone"):
-        next(things)
+        next(items)
 
 
-@pytest.mark.parametrize(("size", "most"), [(AHEAD // 4, 4), (2 * AHEAD, 0)])
-def test_no_more_is_made_than_there_is_room_for(size: int, most: int) -> None:
-    """The thing that is asked for, those there is room for, and one more that may be on its way."""
+@pytest.mark.parametrize(("size", "max_extra"), [(MAX_PREFETCH_BYTES // 4, 4), (2 * MAX_PREFETCH_BYTES, 0)])
+def test_prefetch_is_limited_by_size(size: int, max_extra: int) -> None:
+    """At most the requested items, those within the limit, and one in production."""
     source = Source(100)
-    with closing(ahead(source.numbers(), lambda _: size)) as things:
-        for asked in range(1, 10):
-            next(things)
+    with closing(prefetch(source.numbers(), lambda _: size)) as items:
+        for requested in range(1, 10):
+            next(items)
             time.sleep(0.02)
-            assert source.made <= asked + most + 1
-    assert source.made < 20
+            assert source.produced <= requested + max_extra + 1
+    assert source.produced < 20
 
 
-def test_who_stops_reading_stops_the_making() -> None:
+def test_closing_stops_the_source() -> None:
     source = Source(10**9)
-    things = ahead(source.numbers(), lambda _: AHEAD // 10)
-    assert next(things) == 0
-    things.close()
+    items = prefetch(source.numbers(), lambda _: MAX_PREFETCH_BYTES // 10)
+    assert next(items) == 0
+    items.close()
     assert source.closed.is_set()
-    made = source.made
+    produced = source.produced
     time.sleep(0.02)
-    assert source.made == made
+    assert source.produced == produced

@@ -1,9 +1,10 @@
 from pathlib import Path
 
+from support import write_video
+
 from rafl.calibration.camera import OrthographicCamera
 from rafl.calibration.rig import Rig
 from rafl.tracking.video.recordings import find_recordings
-from support import write_video
 
 
 def camera() -> OrthographicCamera:

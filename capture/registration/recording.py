@@ -1,0 +1,31 @@
+"""Marker positions of one recording before its registration to a specimen."""
+
+from dataclasses import dataclass
+from typing import Any
+
+from numpy.typing import NDArray
+
+Array = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Marker positions of one recording, in the coordinate frame of the file.
+
+    Attributes:
+        names: of the markers, (M); None if the file has none.
+        time: [s], (T).
+        position: [m], (T, M, 3), NaN where missing.
+        sigma: standard deviation [m], (T, M, 3).
+        rest: positions of the undeformed specimen in the same frame [m], (M, 3), if recorded.
+        in_specimen_frame: whether a calibration has put the positions into the specimen frame.
+        source: file name and SHA-256.
+    """
+
+    names: tuple[str, ...] | None
+    time: Array
+    position: Array
+    sigma: Array
+    rest: Array | None
+    in_specimen_frame: bool
+    source: str
