@@ -1,199 +1,244 @@
-"""What the markers of a recording look like."""
+"""The appearance of a recording's markers, found from one frame."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
-from rafl.tracking.detection.detect import (
-    LEAST_CONTRAST,
-    SAME_PLACE,
-    SHADES,
-    VAGUEST,
-    Dots,
-    apart,
-    candidates,
-    dots_at,
-    fit_dots,
-    shade_of,
-)
 from scipy.spatial import cKDTree
 
-SHARP = 0.08  # px: a localisation error that a printed dot stays under
-UNLIKE = 3.0  # such differences added up, in usual ones: a dot that is none of the family
-STRANGE = 4.5  # likewise, though it stands where the family's rows go on: under a gloss a dot hardly looks like one
-AROUND, IN_LINE, LINES = 8, 0.12, 3  # nearest members, of their distance, and how many lines it then must stand in
-BESIDE = 0.5  # sine of the angle from the line to its nearest neighbour, from which on one stands beside a member
-NEXT = 1.3  # breadths: farther from all members no row goes on, though lines lead there
-DARKER = 0.15  # of its neighbours' light: a gloss adds some, so that such a dot's surroundings are hardly darker
-DIM, DIMMEST = 0.3, 0.15  # of the usual contrast; between them a dot must keep back as large a share of the light
-BLACKEST = 1.25  # shade: a dot that seems to keep back more than all light is none
-SPOT_SHARE, SPOT_LEAST = 0.3, 0.5  # of the usual and of the dimmest marker's contrast: what a spot must stand out by
-WORST_SIGMA = 0.4  # px: a dot located worse than this is none
+from rafl.tracking.detection.detect import (
+    MAX_RADIUS_TOLERANCE,
+    MIN_CONTRAST,
+    MIN_SEPARATION_RADII,
+    RELATIVE_CONTRAST_TOLERANCE,
+    Dots,
+    find_candidates,
+    fit_candidates,
+    fit_dots,
+    relative_contrast,
+    remove_duplicates,
+)
+
+Array = NDArray[Any]
+
+REFERENCE_SIGMA = 0.08  # px: a printed dot is located better than this
+MAX_DISSIMILARITY = 3.0  # see `_dissimilarity`: a dot above it is no marker
+MAX_ROW_DISSIMILARITY = 4.5  # the same where the markers' rows continue: specular highlights change the appearance
+LINE_NEIGHBOURS = 8  # nearest markers with which a dot may form a line
+LINE_TOLERANCE = 0.12  # fraction of the neighbour's distance: how far a marker may be beside its position on the line
+MIN_LINES = 3  # lines that a dot must lie on to count as in the markers' rows
+MIN_ROW_SINE = 0.5  # sine of the angle to the nearest neighbour's direction: above it, a marker lies in another row
+MAX_EXTENSION_ROW_SPACINGS = 1.3  # row spacings: no row continues farther than this from all markers
+MAX_DARKENING = 0.15  # fraction of the neighbours' light: highlights add light, so surroundings are hardly darker
+MIN_CONTRAST_RATIO = 0.3  # of the median contrast; below it, the relative contrast must be that of the markers too
+MIN_SHADED_CONTRAST_RATIO = 0.15  # of the median contrast: no marker has less
+MAX_RELATIVE_CONTRAST = 1.25  # 1 is a black dot
+BLOB_CONTRAST_OF_MEDIAN = 0.3  # a blob's smallest contrast as a fraction of the markers' median contrast
+BLOB_CONTRAST_OF_WEAKEST = 0.5  # the same as a fraction of the weakest marker's contrast
+MAX_CENTRE_SIGMA = 0.4  # px: a dot located worse than this is no marker
 
 
 @dataclass(frozen=True)
-class Family:
+class MarkerAppearance:
     """What the markers of a recording have in common.
 
     Attributes:
-        dark: darker than their surroundings.
+        dark: whether they are darker than their surroundings.
         radius: median [px].
         contrast: median [grey levels].
-        shade: median, see `Dots.shade`.
+        relative_contrast: median, see `Dots.relative_contrast`.
     """
 
     dark: bool
     radius: float
     contrast: float
-    shade: float
+    relative_contrast: float
 
     @classmethod
-    def of(cls, dark: bool, dots: Dots) -> "Family":
-        """That of these dots."""
-        return cls(dark, *(float(np.median(figure)) for figure in (dots.radius, dots.contrast, dots.shade)))
+    def from_dots(cls, dark: bool, dots: Dots) -> "MarkerAppearance":
+        """The appearance of these dots."""
+        return cls(dark, *(float(np.median(value)) for value in (dots.radius, dots.contrast, dots.relative_contrast)))
 
-    def least(self, dimmest: float) -> float:
-        """What a spot must stand out by, where the dimmest of the markers has this contrast [grey levels]."""
-        return float(np.copysign(min(SPOT_SHARE * abs(self.contrast), SPOT_LEAST * abs(dimmest)), self.contrast))
+    def min_blob_contrast(self, weakest: float) -> float:
+        """The smallest contrast of a blob that may be a marker, signed, given the weakest marker's [grey levels]."""
+        return float(
+            np.copysign(
+                min(BLOB_CONTRAST_OF_MEDIAN * abs(self.contrast), BLOB_CONTRAST_OF_WEAKEST * abs(weakest)),
+                self.contrast,
+            )
+        )
 
-    def admits(self, dots: Dots) -> NDArray[np.bool_]:
-        """Which dots could be markers of this family, (D)."""
-        figures = dots.radius, dots.vague, dots.flattening, dots.parameters, dots.misfit, dots.used, dots.sigma
-        return _admitted(self.radius, self.contrast, self.shade, *figures)
+    def matches(self, dots: Dots) -> NDArray[np.bool_]:
+        """Which dots could be markers of this appearance, (D)."""
+        values = (
+            dots.radius,
+            dots.relative_radius_sigma,
+            dots.axis_ratio,
+            dots.parameters,
+            dots.misfit,
+            dots.mean_weight,
+            dots.sigma,
+        )
+        return np.asarray(_matches(self.radius, self.contrast, self.relative_contrast, *values))
 
 
 @njit(cache=True)
-def _admitted(usual_radius, usual_contrast, usual_shade, radius, vague, flattening, parameters, misfit, used, sigma):
+def _matches(
+    median_radius: float,
+    median_contrast: float,
+    median_relative_contrast: float,
+    radius: Array,
+    relative_radius_sigma: Array,
+    axis_ratio: Array,
+    parameters: Array,
+    misfit: Array,
+    mean_weight: Array,
+    sigma: Array,
+) -> Array:
     good = np.empty(len(radius), np.bool_)
     for k in range(len(radius)):
         contrast, level = parameters[k, 8], parameters[k, 9]
-        ratio = contrast / usual_contrast
+        ratio = contrast / median_contrast
         good[k] = (
-            abs(np.log(radius[k] / usual_radius)) < np.log(1.35) + 2.0 * min(vague[k], VAGUEST)
-            and flattening[k] > 0.45
-            and DIMMEST < ratio < 3.0
-            and (ratio > DIM or abs(np.log(shade_of(contrast, level) / usual_shade)) < SHADES)
-            and abs(contrast) > LEAST_CONTRAST
+            abs(np.log(radius[k] / median_radius))
+            < np.log(1.35) + 2.0 * min(relative_radius_sigma[k], MAX_RADIUS_TOLERANCE)
+            and axis_ratio[k] > 0.45
+            and MIN_SHADED_CONTRAST_RATIO < ratio < 3.0
+            and (
+                ratio > MIN_CONTRAST_RATIO
+                or abs(np.log(relative_contrast(contrast, level) / median_relative_contrast))
+                < RELATIVE_CONTRAST_TOLERANCE
+            )
+            and abs(contrast) > MIN_CONTRAST
             and misfit[k] < 0.2
-            and used[k] > 0.55
-            and sigma[k, 0] < WORST_SIGMA
-            and sigma[k, 1] < WORST_SIGMA
+            and mean_weight[k] > 0.55
+            and sigma[k, 0] < MAX_CENTRE_SIGMA
+            and sigma[k, 1] < MAX_CENTRE_SIGMA
         )
     return good
 
 
-def _quality(dots: Dots) -> NDArray:
-    """How much each counts, (D): a printed dot is located several times as well as a blot that happens to be round."""
-    return 1.0 / (1.0 + (dots.sigma.max(axis=1) / SHARP) ** 2) ** 3
+def _quality(dots: Dots) -> Array:
+    """Weight of each dot, (D): a printed dot has a sigma several times smaller than that of a round background blob."""
+    return np.asarray(1.0 / (1.0 + (dots.sigma.max(axis=1) / REFERENCE_SIGMA) ** 2) ** 3)
 
 
-def _usual(figure: NDArray, quality: NDArray) -> float:
-    """The median: of round blots there may be more than of markers, but they count less."""
-    order = np.argsort(figure)
-    counted = np.cumsum(quality[order])
-    return float(figure[order[np.searchsorted(counted, 0.5 * counted[-1])]])
+def _weighted_median(values: Array, quality: Array) -> float:
+    """The median by quality: round background blobs may outnumber the markers, but weigh less."""
+    order = np.argsort(values)
+    cumulative = np.cumsum(quality[order])
+    return float(values[order[np.searchsorted(cumulative, 0.5 * cumulative[-1])]])
 
 
-def _unlike(dots: Dots, usual: Dots) -> NDArray:
-    """How they differ from the usual in size, contrast, fit, sigma and blur taken together, in usual differences, (D).
+def _dissimilarity(dots: Dots, markers: Dots) -> Array:
+    """Root sum of squares of the dots' normalised differences from the markers, (D).
 
-    A blot is a little off in all.
+    The differences are those in radius, contrast, misfit, sigma and blur, each over its usual size. A background blob
+    differs a little in all of them. Dots of an impossible relative contrast get infinity.
     """
-    quality, vague = _quality(usual), np.minimum(dots.vague, VAGUEST)
-    unlike = np.log(dots.radius / _usual(usual.radius, quality)) ** 2 / (0.12**2 + vague**2)
-    contrast = np.log(dots.contrast / _usual(usual.contrast, quality))
-    shade = np.log(dots.shade / _usual(usual.shade, quality))
-    # Where less light falls on a dot, it differs more, and keeps back as large a share.
-    unlike += np.minimum((contrast / 0.35) ** 2, (contrast / 0.7) ** 2 + (shade / 0.1) ** 2)
-    # Where the light is dim there is more noise, and of little noise nobody asks how much it is.
-    misfit, residual = _usual(usual.misfit, quality), _usual(usual.residual, quality)
-    beyond = np.maximum(np.minimum(dots.misfit - misfit, dots.residual - residual), 0.0)
-    unlike += (beyond / np.maximum(max(0.5 * misfit, 0.02), 0.25 * dots.residual)) ** 2
-    # A stain has no edge to locate it by; but a marker may be under a glint or farther out of focus than the others.
-    sigma, blur = _usual(usual.sigma.max(axis=1), quality), _usual(usual.blur, quality)
-    unlike += np.maximum(np.log(dots.sigma.max(axis=1) / max(sigma, 0.01)) / 0.55, 0.0) ** 2
-    unlike += np.maximum(np.log(dots.blur / max(blur, 0.5)) / 0.45, 0.0) ** 2
-    return np.where(dots.shade < BLACKEST + 2.0 * vague, np.sqrt(unlike), np.inf)
+    quality, radius_sigma = _quality(markers), np.minimum(dots.relative_radius_sigma, MAX_RADIUS_TOLERANCE)
+    total = np.log(dots.radius / _weighted_median(markers.radius, quality)) ** 2 / (0.12**2 + radius_sigma**2)
+    contrast = np.log(dots.contrast / _weighted_median(markers.contrast, quality))
+    relative = np.log(dots.relative_contrast / _weighted_median(markers.relative_contrast, quality))
+    # Less light on a dot changes its contrast but not its relative contrast.
+    total += np.minimum((contrast / 0.35) ** 2, (contrast / 0.7) ** 2 + (relative / 0.1) ** 2)
+    # Dim light increases the noise. The pixel noise is not estimated where it is small, so the residual counts too.
+    misfit, residual = _weighted_median(markers.misfit, quality), _weighted_median(markers.residual, quality)
+    excess = np.maximum(np.minimum(dots.misfit - misfit, dots.residual - residual), 0.0)
+    total += (excess / np.maximum(max(0.5 * misfit, 0.02), 0.25 * dots.residual)) ** 2
+    # A background blob has no sharp edge. But a marker may have a highlight or be more out of focus than the others.
+    sigma, blur = _weighted_median(markers.sigma.max(axis=1), quality), _weighted_median(markers.blur, quality)
+    total += np.maximum(np.log(dots.sigma.max(axis=1) / max(sigma, 0.01)) / 0.55, 0.0) ** 2
+    total += np.maximum(np.log(dots.blur / max(blur, 0.5)) / 0.45, 0.0) ** 2
+    return np.where(dots.relative_contrast < MAX_RELATIVE_CONTRAST + 2.0 * radius_sigma, np.sqrt(total), np.inf)
 
 
-def lines_through(place: NDArray, members: NDArray, most: float = np.inf) -> int:
-    """In how many lines with two of the members (M, 2) a place (2) stands, as far apart, between or next to them.
+def count_lines_through(position: Array, markers: Array, max_offset: float = np.inf) -> int:
+    """Count the lines that a position (2) forms with two of the markers (M, 2), at equal distances.
 
-    It may be beside these by `IN_LINE` of their distance, and by so much at most [px].
+    The position is the middle of the line or, next to the two markers, its end. The third point may be beside the line
+    by `LINE_TOLERANCE` of the distance, and by max_offset at most [px].
     """
-    way = members - place
-    distance = np.linalg.norm(way, axis=1)
-    near = np.argsort(distance)[:AROUND]
-    beside = np.minimum(IN_LINE * distance[near], most)
-    tree = cKDTree(members)
-    in_line = [tree.query(end)[0] < beside for end in (place + 2.0 * way[near], place - way[near])]
+    offset = markers - position
+    distance = np.linalg.norm(offset, axis=1)
+    near = np.argsort(distance)[:LINE_NEIGHBOURS]
+    tolerance = np.minimum(LINE_TOLERANCE * distance[near], max_offset)
+    tree = cKDTree(markers)
+    in_line = [tree.query(end)[0] < tolerance for end in (position + 2.0 * offset[near], position - offset[near])]
     return int(in_line[0].sum() + in_line[1].sum() // 2)
 
 
 @njit(cache=True)
-def breadth_of(rest):
-    """How far apart the lines of markers (M, 2) are.
+def row_spacing(markers: Array) -> float:
+    """Distance between the rows of markers (M, 2) [px].
 
-    The usual distance to the nearest that is not in line with the nearest.
+    It is the median distance to the nearest marker that does not lie in the direction of the nearest one.
     """
-    count = len(rest)
-    breadths = np.empty(count)
+    count = len(markers)
+    spacings = np.empty(count)
     for k in range(count):
-        ways = rest - rest[k]
-        distance = np.hypot(ways[:, 0], ways[:, 1])
+        offsets = markers - markers[k]
+        distance = np.hypot(offsets[:, 0], offsets[:, 1])
         distance[k] = np.inf
         nearest = np.argmin(distance)
-        along = ways[nearest] / max(distance[nearest], 1e-9)
-        breadths[k] = np.inf
+        along = offsets[nearest] / max(distance[nearest], 1e-9)
+        spacings[k] = np.inf
         for other in range(count):
-            sine = abs(along[0] * ways[other, 1] - along[1] * ways[other, 0]) / max(distance[other], 1e-9)
-            if other != k and sine > BESIDE:
-                breadths[k] = min(breadths[k], distance[other])
-        if breadths[k] == np.inf:
-            breadths[k] = distance[nearest]
-    return np.median(breadths)
+            sine = abs(along[0] * offsets[other, 1] - along[1] * offsets[other, 0]) / max(distance[other], 1e-9)
+            if other != k and sine > MIN_ROW_SINE:
+                spacings[k] = min(spacings[k], distance[other])
+        if spacings[k] == np.inf:
+            spacings[k] = distance[nearest]
+    return float(np.median(spacings))
 
 
-def find_family(image: NDArray) -> tuple[Family, Dots] | None:
-    """The markers of a picture: the largest set of well-located dots alike in size and contrast."""
-    best: tuple[float, Family, Dots, NDArray] | None = None
+def find_markers(image: Array) -> tuple[MarkerAppearance, Dots] | None:
+    """Find the markers in a frame (H, W): the largest set of well-located dots alike in size and contrast.
+
+    Returns their appearance and the dots; None if there are no dots.
+    """
+    best: tuple[float, MarkerAppearance, Dots, Array] | None = None
     for dark in (True, False):
-        start = candidates(image, dark)
-        dots = dots_at(image, start, dark)
-        dots = dots[(dots.misfit < 0.15) & (dots.flattening > 0.5)]
+        candidates = find_candidates(image, dark)
+        dots = fit_candidates(image, candidates, dark)
+        dots = dots[(dots.misfit < 0.15) & (dots.axis_ratio > 0.5)]
         quality = _quality(dots)
         for seed in range(len(dots)):
-            vague = np.minimum(dots.vague + dots.vague[seed], VAGUEST)
-            alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2) + 2.0 * vague
+            tolerance = np.minimum(dots.relative_radius_sigma + dots.relative_radius_sigma[seed], MAX_RADIUS_TOLERANCE)
+            alike = np.abs(np.log(dots.radius / dots.radius[seed])) < np.log(1.2) + 2.0 * tolerance
             alike &= np.abs(np.log(dots.contrast / dots.contrast[seed])) < np.log(2.2)
             score = float(quality[alike].sum())
             if best is None or score > best[0]:
-                members = dots[alike]
-                members = members[_unlike(members, members) < UNLIKE]
-                best = (score, Family.of(dark, members), members, start)
-    return None if best is None else (best[1], _with_relatives(image, *best[1:]))
+                markers = dots[alike]
+                markers = markers[_dissimilarity(markers, markers) < MAX_DISSIMILARITY]
+                best = (score, MarkerAppearance.from_dots(dark, markers), markers, candidates)
+    return None if best is None else (best[1], _add_similar_dots(image, *best[1:]))
 
 
-def _with_relatives(image: NDArray, family: Family, members: Dots, start: NDArray) -> Dots:
-    """The members and the candidates (D, 12) that are some after all, fitted anew from what the members look like."""
-    gaps = np.linalg.norm(start[:, None, :2] - members.centre, axis=2)
-    left = start[gaps.min(axis=1) > SAME_PLACE * family.radius]
-    left[:, 2:9] = np.median(members.parameters[:, 2:9], axis=0)
-    anew = fit_dots(image, np.concatenate([members.parameters, left]))
-    first, more = anew[: len(members)], anew[len(members) :]
-    good, more = family.admits(first), more[family.admits(more) & more.within(image)]
-    unlike = _unlike(more, members)
-    nearest = np.arange(min(AROUND, len(members))) + 1
-    near = cKDTree(members.centre).query(more.centre, nearest)[1]
-    level = np.median(members.parameters[near, 9], axis=1)
-    light = np.maximum(level, level + family.contrast)
-    glossy = (unlike < STRANGE) & (level - more.parameters[:, 9] < DARKER * light)
-    next_to = NEXT * breadth_of(members.centre)
-    kin, before = unlike < UNLIKE, -1
-    while kin.sum() > before:  # each that is found lengthens lines
-        before = int(kin.sum())
-        known = np.concatenate([members.centre, more.centre[kin]])
-        lines = np.array([lines_through(place, known) for place in more.centre], int)
-        kin |= (lines >= LINES) & (cKDTree(known).query(more.centre)[0] < next_to) & glossy
-    return apart(first[good].beside(members[~good]).beside(more[kin]), SAME_PLACE * family.radius)
+def _add_similar_dots(image: Array, appearance: MarkerAppearance, markers: Dots, candidates: Array) -> Dots:
+    """The markers and those candidates (D, 12) that prove to be markers when fitted from the median appearance."""
+    gaps = np.linalg.norm(candidates[:, None, :2] - markers.centre, axis=2)
+    left = candidates[gaps.min(axis=1) > MIN_SEPARATION_RADII * appearance.radius]
+    left[:, 2:9] = np.median(markers.parameters[:, 2:9], axis=0)
+    refitted = fit_dots(image, np.concatenate([markers.parameters, left]))
+    first, more = refitted[: len(markers)], refitted[len(markers) :]
+    good, more = appearance.matches(first), more[appearance.matches(more) & more.within(image)]
+    dissimilarity = _dissimilarity(more, markers)
+    nearest = np.arange(min(LINE_NEIGHBOURS, len(markers))) + 1
+    near = cKDTree(markers.centre).query(more.centre, nearest)[1]
+    level = np.median(markers.parameters[near, 9], axis=1)
+    light = np.maximum(level, level + appearance.contrast)
+    may_have_highlight = (dissimilarity < MAX_ROW_DISSIMILARITY) & (
+        level - more.parameters[:, 9] < MAX_DARKENING * light
+    )
+    reach = MAX_EXTENSION_ROW_SPACINGS * row_spacing(markers.centre)
+    accepted, before = dissimilarity < MAX_DISSIMILARITY, -1
+    while accepted.sum() > before:  # each accepted dot extends rows
+        before = int(accepted.sum())
+        known = np.concatenate([markers.centre, more.centre[accepted]])
+        lines = np.array([count_lines_through(position, known) for position in more.centre], int)
+        accepted |= (lines >= MIN_LINES) & (cKDTree(known).query(more.centre)[0] < reach) & may_have_highlight
+    all_dots = first[good].extended_by(markers[~good]).extended_by(more[accepted])
+    return remove_duplicates(all_dots, MIN_SEPARATION_RADII * appearance.radius)

@@ -1,9 +1,13 @@
-"""A soft-edged elliptical disc in a picture: which pixels tell of it, and how they follow its parameters.
+"""Model of a soft-edged elliptical disc: which pixels belong to it, and their derivatives by its parameters.
 
-The outline is |A (x - c)| = 1 with A symmetric. Across it the level changes as the running integral of a
-bell curve whose variance along the outline's normal n is n . W n: lens blur, the pixel's own width and the
-smear of motion during the exposure all add to W. The light falls off evenly across the disc and around it,
-by the factor 1 + slopes . (x - c).
+The outline is |A (x - c)| = 1 with A symmetric. Across it the level changes as the integral of a bell curve whose
+variance along the outline's normal n is n . W n. Lens blur, the pixel's own width and motion blur all add to W. The
+light falls off linearly across the disc and around it, by the factor 1 + slopes . (x - c).
+
+A fit's parameters p (12) are the centre (2) [px], A (3: xx, xy, yy) [1/px], W (3: xx, xy, yy) [px^2], contrast and
+level [grey levels], and the slopes of the light (2) [1/px].
+
+A fit works in one scratch array w of float32, so that the compiler sees that its rows do not overlap.
 """
 
 from math import comb
@@ -15,28 +19,30 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-PARAMETERS = 12  # centre (2), A (3: xx, xy, yy), W (3: xx, xy, yy) [px^2], contrast, level, slopes of the light (2)
-LARGEST = 8192  # pixels a fit looks at
-LINE = 64  # pixels that memory gives at a time
-CHUNK = 256  # pixels whose derivatives are held at a time, so that they stay in the nearest cache
-LANES = 32  # pixels that vector instructions take at a time; a fit's last ones are filled up by some of no weight
+PARAMETER_COUNT = 12
+MAX_PIXELS = 8192  # pixels of a fit
+CACHE_LINE_PIXELS = 64  # 8-bit pixels in a cache line
+CHUNK = 256  # pixels whose derivatives are kept at a time, so that they stay in the first-level cache
+SIMD_LANES = 32  # pixels that SIMD instructions process at a time; a fit's pixels are padded to a multiple of it
 
-# Rows of a fit's scratch, one array: so the compiler sees that no two of them overlap.
-X, Y, VALUE, WEIGHT, RESIDUAL, SIZE, SHOWN, FLAT = (LARGEST * row for row in range(8))
-BLOCK_OF = SIZE  # at another time
-J = 8 * LARGEST  # a chunk's derivatives by the parameters, 12 rows, and its residual
+# Offsets in the scratch array. For each pixel: position relative to the rounded centre [px], grey level, weight,
+# residual, working space, weight by its level (see `disc_fit`), and whether the model is flat there.
+X, Y, VALUE, WEIGHT, RESIDUAL, WORK, LEVEL_WEIGHT, FLAT = (MAX_PIXELS * row for row in range(8))
+BLOCK_INDEX = WORK  # the same space at another time
+J = 8 * MAX_PIXELS  # a chunk's derivatives by the parameters, 12 rows, and its residual
 WEIGHTED = J + 13 * CHUNK  # two rows
-SCRATCH = WEIGHTED + 2 * CHUNK
-LEAST_BLUR, MOST_BLUR = 0.08, 40.0  # of W along any direction [px^2]
-# How far from the outline a fit looks: so many standard deviations of a blurred edge and a share of the radius, but no
-# farther than so many radii and px, or so many standard deviations past the end of a smear's way: the edge of a sticker
-# that the dot is on would pass for its blur.
-REACHED, MARGIN, FARTHEST, PAST_END = 3.0, 0.3, (0.5, 5.0), 1.5
-REACH = 4.0  # half the bell curve's support, in standard deviations
+SCRATCH_SIZE = WEIGHTED + 2 * CHUNK
+MIN_EDGE_VARIANCE, MAX_EDGE_VARIANCE = 0.08, 40.0  # px^2: of W along any direction
+# A fit uses the pixels within a margin of the outline: MARGIN_EDGE_SIGMAS standard deviations of the blurred edge, plus
+# MARGIN_RADII radii. The first part is at most MAX_MARGIN (fraction of the radius, plus px), or MOTION_END_SIGMAS
+# standard deviations past the end of the motion, if that is more. Farther out, the edge of a sticker that the dot is on
+# would pass for the dot's blur.
+MARGIN_EDGE_SIGMAS, MARGIN_RADII, MAX_MARGIN, MOTION_END_SIGMAS = 3.0, 0.3, (0.5, 5.0), 1.5
+PROFILE_SUPPORT = 4.0  # standard deviations: half the bell curve's support
 
 # The bell (1 - z^2 / 16)^8 on |z| < 4 is close to exp(-z^2 / 2) and integrates to an odd polynomial.
 _SERIES = np.array([comb(8, k) * (-1.0 / 16.0) ** k / (2 * k + 1) for k in range(9)])
-_HEIGHT = 0.5 / (REACH * float(np.polyval(_SERIES[::-1], REACH**2)))
+_HEIGHT = 0.5 / (PROFILE_SUPPORT * float(np.polyval(_SERIES[::-1], PROFILE_SUPPORT**2)))
 _S = [float(c * _HEIGHT) for c in _SERIES]
 _S0, _S1, _S2, _S3, _S4, _S5, _S6, _S7, _S8 = _S
 
@@ -49,10 +55,10 @@ FAST: dict[str, Any] = {
 
 
 @njit(**FAST)
-def choose_pixels(image, p, near, w):
-    """The pixels a fit looks at, relative to the rounded centre; returns how many.
+def select_pixels(image, p, near, w):
+    """Fill the positions and levels of the pixels that a fit uses; returns how many.
 
-    Where the disc's level or its surroundings' is flat every other pixel is enough.
+    Every other pixel is enough where the disc's level or that of its surroundings is flat.
 
     near (K, 3): centre and radius of other dots, whose pixels are left out.
     """
@@ -63,11 +69,11 @@ def choose_pixels(image, p, near, w):
     if not half - spread > 0.01:
         return 0
     smallest, largest = 1.0 / (half + spread), 1.0 / (half - spread)
-    mean, smeared = 0.5 * (p[5] + p[7]), np.sqrt(0.25 * (p[5] - p[7]) ** 2 + p[6] * p[6])
-    way_end = 0.5 * np.sqrt(24.0 * smeared) + PAST_END * np.sqrt(max(mean - smeared, 0.0))
-    farthest = max(FARTHEST[0] * smallest + FARTHEST[1], way_end - MARGIN * smallest)
-    edge = min(REACHED * np.sqrt(max(mean, 0.5)) + 1.0, farthest)
-    margin = (1.0 + edge) / smallest + MARGIN
+    mean, motion_variance = 0.5 * (p[5] + p[7]), np.sqrt(0.25 * (p[5] - p[7]) ** 2 + p[6] * p[6])
+    motion_end = 0.5 * np.sqrt(24.0 * motion_variance) + MOTION_END_SIGMAS * np.sqrt(max(mean - motion_variance, 0.0))
+    max_edge = max(MAX_MARGIN[0] * smallest + MAX_MARGIN[1], motion_end - MARGIN_RADII * smallest)
+    edge = min(MARGIN_EDGE_SIGMAS * np.sqrt(max(mean, 0.5)) + 1.0, max_edge)
+    margin = (1.0 + edge) / smallest + MARGIN_RADII
     inside, outside, end = max(1.0 - edge / smallest, 0.0) ** 2, (1.0 + edge / smallest) ** 2, (1.0 + margin) ** 2
     window = int(largest * (1.0 + margin)) + 1
     # |A d|^2 = along (dx + lean dy)^2 + across dy^2
@@ -77,11 +83,11 @@ def choose_pixels(image, p, near, w):
     top, bottom = max(y0 - window, 0), min(y0 + window + 1, height)
     left, right = max(x0 - window, 0), min(x0 + window, width - 1)
     touched = 0
-    for row in range(top, bottom):  # asks for all rows at once, of a picture that no cache holds yet
-        for column in range(left, right, LINE):
+    for row in range(top, bottom):  # prefetch all rows at once: no cache holds the frame yet
+        for column in range(left, right, CACHE_LINE_PIXELS):
             touched += image[row, column]
         touched += image[row, max(right, 0)]
-    w[SIZE] = touched
+    w[WORK] = touched
     count = 0
     for row in range(top, bottom):
         least = across * (row - p[1]) ** 2
@@ -89,7 +95,7 @@ def choose_pixels(image, p, near, w):
             continue
         middle, reach = p[0] - lean * (row - p[1]), np.sqrt((end - least) / along)
         first, last = max(int(np.ceil(middle - reach)), 0), min(int(np.floor(middle + reach)), width - 1)
-        if count + last - first >= LARGEST - CHUNK:
+        if count + last - first >= MAX_PIXELS - CHUNK:
             return 0
         line = image[row]
         for column in range(first, last + 1):
@@ -98,16 +104,16 @@ def choose_pixels(image, p, near, w):
             w[X + count] = column - x0
             w[Y + count] = row - y0
             w[VALUE + count] = line[np.uintp(column)]
-            count += 1 - skipped  # no branch: where the pattern ends is nothing that a processor can foresee
-    count = _without(near, x0, y0, count, w)
-    for k in range(count, filled_up(count)):
+            count += 1 - skipped  # no branch: a processor could not predict it
+    count = _exclude_neighbours(near, x0, y0, count, w)
+    for k in range(count, pad_to_lanes(count)):
         w[X + k] = w[Y + k] = w[VALUE + k] = w[WEIGHT + k] = np.float32(0.0)
     return count
 
 
 @njit(**FAST)
-def _without(near, x0, y0, count, w):
-    """Leaves out other dots' pixels; returns how many stay."""
+def _exclude_neighbours(near, x0, y0, count, w):
+    """Remove the pixels of other dots; returns how many remain."""
     for other in range(near.shape[0]):
         x, y, square = near[other, 0] - x0, near[other, 1] - y0, (near[other, 2] + 3.0) ** 2
         kept = 0
@@ -119,20 +125,20 @@ def _without(near, x0, y0, count, w):
 
 
 @njit(**FAST)
-def filled_up(count):
-    """So many pixels and those that fill them up to a multiple of `LANES`."""
-    return (count + LANES - 1) // LANES * LANES
+def pad_to_lanes(count):
+    """Round a number of pixels up to a multiple of `SIMD_LANES`."""
+    return (count + SIMD_LANES - 1) // SIMD_LANES * SIMD_LANES
 
 
 @njit(**FAST)
 def linearise(p, instants, x0, y0, first, count, w):
-    """Derivatives of a chunk's pixels, from the `first`, by the parameters, and the residual.
+    """Fill the residuals of the chunk of pixels that starts at `first`, and their derivatives by the parameters.
 
-    A disc that moves far while the shutter is open is a mean over several instants; p[5:8] are then the
-    edge's variance and the way moved instead of W.
+    A disc that moves far during the exposure is a mean over several instants. Then p[5:8] are the edge's variance and
+    the displacement (2) instead of W.
     """
-    count = min(count, CHUNK)  # said aloud, with the next, so that the loops become vector instructions
-    first = min(max(first, 0), LARGEST - CHUNK)
+    count = min(count, CHUNK)  # these two limits let the compiler vectorise the loops
+    first = min(max(first, 0), MAX_PIXELS - CHUNK)
     fx = p[0] - x0
     fy = p[1] - y0
     one = np.float32(1.0)
@@ -142,9 +148,9 @@ def linearise(p, instants, x0, y0, first, count, w):
     b = np.float32(p[3])
     c = np.float32(p[4])
     w0 = np.float32(p[5])
-    smeared = instants > 1
-    w1 = np.float32(0.0 if smeared else 2.0 * p[6])
-    w2 = np.float32(p[5] if smeared else p[7])
+    moving = instants > 1
+    w1 = np.float32(0.0 if moving else 2.0 * p[6])
+    w2 = np.float32(p[5] if moving else p[7])
     contrast = np.float32(p[8] / instants)
     level = np.float32(p[9])
     sx = np.float32(p[10])
@@ -155,16 +161,16 @@ def linearise(p, instants, x0, y0, first, count, w):
         for k in range(count):
             w[J + i * CHUNK + k] = np.float32(0.0)
     share = one / np.float32(instants)
-    # What p[5:8] mean is told by factors: a branch among the pixels would keep them from vector instructions.
-    round_ = np.float32(1.0 if smeared else 0.0)
-    once, twice = one - round_, np.float32(2.0) * (one - round_)
+    # Factors select the meaning of p[5:8]: a branch in the loops over the pixels would prevent SIMD instructions.
+    isotropic = np.float32(1.0 if moving else 0.0)
+    only_w, twice_w = one - isotropic, np.float32(2.0) * (one - isotropic)
     for instant in range(instants):
-        u = np.float32((instant + 0.5) / instants - 0.5)
-        way = u * round_
-        mx = np.float32(fx + u * p[6]) if smeared else cx
-        my = np.float32(fy + u * p[7]) if smeared else cy
-        # One short loop after another, by way of rows that the light's derivatives fill last: in one long loop every
-        # pixel would wait for the one before.
+        time = np.float32((instant + 0.5) / instants - 0.5)
+        displacement_share = time * isotropic
+        mx = np.float32(fx + time * p[6]) if moving else cx
+        my = np.float32(fy + time * p[7]) if moving else cy
+        # Several short loops, which pass values in rows that the derivatives by the light fill last. In one long loop,
+        # every pixel would wait for the one before.
         for k in range(count):
             dx = w[X + first + k] - mx
             dy = w[Y + first + k] - my
@@ -178,7 +184,7 @@ def linearise(p, instants, x0, y0, first, count, w):
         for k in range(count):
             ax = w[J + 9 * CHUNK + k]
             ay = w[J + 10 * CHUNK + k]
-            gx = a * ax + b * ay  # of r
+            gx = a * ax + b * ay  # gradient of r
             gy = b * ax + c * ay
             inverse_w = one / np.sqrt(w0 * gx * gx + w1 * gx * gy + w2 * gy * gy + tiny)
             z = w[J + 11 * CHUNK + k] * inverse_w
@@ -215,7 +221,7 @@ def linearise(p, instants, x0, y0, first, count, w):
             xx = by_w * gx * gx
             xy = by_w * gx * gy
             yy = by_w * gy * gy
-            # The same blur is a larger share of a smaller dot.
+            # A also changes how large the blur is relative to the radius.
             hx = by_r * dx + np.float32(2.0) * by_w * (w0 * gx + half * w1 * gy)
             hy = by_r * dy + np.float32(2.0) * by_w * (half * w1 * gx + w2 * gy)
             gx *= by_r
@@ -225,9 +231,9 @@ def linearise(p, instants, x0, y0, first, count, w):
             w[J + 2 * CHUNK + k] += ax * hx
             w[J + 3 * CHUNK + k] += ax * hy + ay * hx
             w[J + 4 * CHUNK + k] += ay * hy
-            w[J + 5 * CHUNK + k] += xx + round_ * yy
-            w[J + 6 * CHUNK + k] += twice * xy - way * gx
-            w[J + 7 * CHUNK + k] += once * yy - way * gy
+            w[J + 5 * CHUNK + k] += xx + isotropic * yy
+            w[J + 6 * CHUNK + k] += twice_w * xy - displacement_share * gx
+            w[J + 7 * CHUNK + k] += only_w * yy - displacement_share * gy
     whole = np.float32(p[8])
     for k in range(count):
         dx = w[X + first + k] - cx
@@ -244,18 +250,18 @@ def linearise(p, instants, x0, y0, first, count, w):
 
 
 @njit(**FAST)
-def instants_of(p):
-    """How many instants resolve the way p[6:8] moved during the exposure, and a little more."""
+def count_instants(p):
+    """Number of instants that resolves the displacement p[6:8] during the exposure, with a margin."""
     return min(4 + int(np.hypot(p[6], p[7]) / (1.2 * np.sqrt(p[5]))), 32)
 
 
 @njit(**FAST)
-def smear(p):
-    """Exchanges W, of a long smear, for an edge and a way moved: a box of length m has variance m^2 / 12."""
+def split_motion_blur(p):
+    """Replace W by the edge's variance and the displacement m: a box of length m has variance m^2 / 12."""
     mean = 0.5 * (p[5] + p[7])
     spread = np.sqrt(0.25 * (p[5] - p[7]) ** 2 + p[6] * p[6])
     length = np.sqrt(24.0 * spread)
     angle = 0.5 * np.arctan2(2.0 * p[6], p[5] - p[7])
-    p[5] = max(mean - spread, LEAST_BLUR)
+    p[5] = max(mean - spread, MIN_EDGE_VARIANCE)
     p[6] = length * np.cos(angle)
     p[7] = length * np.sin(angle)

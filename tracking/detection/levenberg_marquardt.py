@@ -1,178 +1,191 @@
-"""Levenberg and Marquardt's steps towards the disc that explains some pixels best, and how well its place is known."""
+"""Levenberg-Marquardt minimisation of a disc's weighted squared residual, and the uncertainty of the result."""
 
 import numpy as np
 from numba import njit
+
 from rafl.tracking.detection.disc_model import (
-    BLOCK_OF,
+    BLOCK_INDEX,
     CHUNK,
     FAST,
-    LARGEST,
-    LEAST_BLUR,
-    MOST_BLUR,
-    PARAMETERS,
+    MAX_EDGE_VARIANCE,
+    MAX_PIXELS,
+    MIN_EDGE_VARIANCE,
+    PARAMETER_COUNT,
     WEIGHT,
     WEIGHTED,
     J,
     X,
     Y,
-    filled_up,
     linearise,
+    pad_to_lanes,
 )
 from rafl.tracking.detection.normal_equations import add_scores, factorise, normal_equations, substitute
 
-# Converged; the centre's variances by independent errors of one grey level (2), by blocks (2); mean squared residual;
-# share used; how far the pixels that are not quite trusted pull the centre (2); the variance of A's mean diagonal by
-# independent errors of one grey level; the pixels' own noise's variance, where the residual is large enough to ask; the
-# variance of what neighbouring pixels' residuals do not share.
-QUALITY = 12
-# Steps that leave the normal matrix nearly as it was: of the centre and of the radius [px], and the share by which the
-# contrast and the edge's variance may change.
-CLOSE, SWELLING, CHANGE = 1.0, 0.3, 0.05
-LITTLE = 1e-3  # of the normal matrix' diagonal: damping that changes neither steps nor variances to speak of
-# The centre's last step [px], and what it may be worth as a share of the squared residual: the next is smaller still.
-SETTLED, WORTH = 0.005, 0.01
-WORTHLESS = 0.4  # of a pixel's mean squared residual: a gain that says nothing more about the disc
-LONGEST = 0.2  # of the radius' square: what W's variance along a large dot's way may be beyond `MOST_BLUR`
-MUCH = 0.1  # damping of the last try, that holds back what the pixels hardly tell and leaves the centre its step
-LEVEL = 1e-3  # of the squared residual: as much as before, but for rounding
-# A step that short [px], after another small one, is the last though the squared residual be larger by that share than
-# before: derivatives leave out how light that falls off and an edge blurred along one way change them, so that where an
-# outline drawn by hand leaves much residual, no step is left where it is not quite the least.
-RESTING, RISEN = 0.02, 1e-2
-DOUBTED = 0.9  # weight: below it a pixel is not quite trusted
-BLOCK = 4  # px: errors closer than this are not taken to be independent
+# Entries of a fit's quality, by index:
+# 0: 1 if it converged; 1, 2: variance of the centre along x and y for independent errors of one grey level [px^2];
+# 3, 4: the same by the residuals summed over blocks of pixels [px^2]; 5: mean squared residual; 6: mean weight;
+# 7, 8: shift of the centre by the pixels of reduced weight [px];
+# 9: variance of A's mean diagonal for independent errors of one grey level;
+# 10: variance of the pixel noise, estimated only where the residual is large;
+# 11: variance of the part of the residual that neighbouring pixels do not share.
+QUALITY_COUNT = 12
+# A step within these three limits leaves the normal matrix nearly unchanged.
+SMALL_SHIFT = 1.0  # px: of the centre
+SMALL_RADIUS_CHANGE = 0.3  # px
+SMALL_RELATIVE_CHANGE = 0.05  # of the contrast and of the edge's standard deviation
+MAX_FINAL_DAMPING = 1e-3  # of the normal matrix's diagonal: less changes neither the steps nor the variances much
+# A step within these two limits is the last but one: the next would be smaller still.
+FINAL_STEP = 0.005  # px: of the centre
+FINAL_GAIN = 0.01  # fraction of the squared residual
+NEGLIGIBLE_GAIN = 0.4  # of one pixel's mean squared residual: a smaller gain says nothing more about the disc
+MAX_MOTION_VARIANCE = 0.2  # of the squared radius: limit of W's variance for large dots, where above MAX_EDGE_VARIANCE
+FALLBACK_DAMPING = 0.1  # of the last attempt: it suppresses poorly determined parameters, but not the centre's step
+ROUNDING_INCREASE = 1e-3  # fraction of the squared residual: an increase that rounding may cause
+# A step of the centre shorter than SHORT_STEP [px] after another small one ends the fit, even if the squared residual
+# grows by this fraction. The derivatives neglect how the light's slope and a directional blur change them. If an
+# irregular outline leaves a large residual, no step remains although the minimum is not quite reached.
+SHORT_STEP, ACCEPTED_INCREASE = 0.02, 1e-2
+REDUCED_WEIGHT = 0.9  # a pixel below this weight counts as one of reduced weight
+BLOCK = 4  # px: errors of pixels closer than this are not assumed to be independent
 
 
 @njit(**FAST)
-def _keep_possible(p, instants):
-    """Keeps W's variances within bounds and its off-diagonal below what makes it indefinite."""
-    widest = max(MOST_BLUR, LONGEST / max(p[2] * p[4] - p[3] * p[3], 1e-12))
-    p[5] = min(max(p[5], LEAST_BLUR), widest)
+def _clip_edge_variance(p, instants):
+    """Clip W's variances to their bounds, and its off-diagonal so that W stays positive definite."""
+    widest = max(MAX_EDGE_VARIANCE, MAX_MOTION_VARIANCE / max(p[2] * p[4] - p[3] * p[3], 1e-12))
+    p[5] = min(max(p[5], MIN_EDGE_VARIANCE), widest)
     if instants > 1:
         return
-    p[7] = min(max(p[7], LEAST_BLUR), widest)
-    most = 0.95 * np.sqrt(p[5] * p[7])
-    p[6] = min(max(p[6], -most), most)
+    p[7] = min(max(p[7], MIN_EDGE_VARIANCE), widest)
+    limit = 0.95 * np.sqrt(p[5] * p[7])
+    p[6] = min(max(p[6], -limit), limit)
 
 
 @njit(**FAST)
-def _is_close(p, step):
-    """Whether a step from p leaves the normal matrix nearly as it was."""
-    swelling = max(abs(step[2]), abs(step[4])) / (p[2] * p[4] - p[3] * p[3])
+def _is_small(p, step):
+    """Whether a step from p leaves the normal matrix nearly unchanged."""
+    radius_change = max(abs(step[2]), abs(step[4])) / (p[2] * p[4] - p[3] * p[3])
     change = max(abs(step[8] / p[8]), 0.5 * (abs(step[5]) + abs(step[7])) / (p[5] + p[7]))
-    return max(abs(step[0]), abs(step[1])) < CLOSE and swelling < SWELLING and change < CHANGE
+    return (
+        max(abs(step[0]), abs(step[1])) < SMALL_SHIFT
+        and radius_change < SMALL_RADIUS_CHANGE
+        and change < SMALL_RELATIVE_CHANGE
+    )
 
 
 @njit(**FAST)
 def _assess(p, instants, x0, y0, count, w, L, quality):
-    """Fills quality and takes a small step by the factor at hand; returns its length, the cost before it and the gain.
+    """Fill quality, and take a small step with the given factor L; returns its length, the cost before it and its gain.
 
-    Variances as independent errors of the residual's size give them, and as the scores summed over blocks
-    of pixels say: compression leaves errors that neighbours share. Pixels that are not quite trusted, at a highlight's
-    edge, may all be off to one side: how far they pull the centre is an error by itself.
+    The centre's variance is computed twice: for independent errors as large as the residual, and from the scores summed
+    over blocks of pixels, because compression causes errors that neighbours share. Pixels of reduced weight, at a
+    highlight's edge, may all have errors of one sign: the shift of the centre that they cause is a further error.
     """
-    n = PARAMETERS
-    pull = np.zeros((2, n))  # rows of H^-1: how the centre follows each score
+    n = PARAMETER_COUNT
+    response = np.zeros((2, n))  # rows of H^-1: the centre's response to each score
     size = np.zeros(n)
     for axis in range(2):
-        pull[axis, axis] = 1.0
-        substitute(L, pull[axis])
+        response[axis, axis] = 1.0
+        substitute(L, response[axis])
         size[2 + 2 * axis] = 0.5
     substitute(L, size)
     side = _number_blocks(count, w)
     blocks = np.zeros((2, side * side))
-    white, doubted = np.zeros(2), np.zeros(2)
+    independent, shift = np.zeros(2), np.zeros(2)
     score = np.zeros(n)
     cost = 0.0
-    used = 0.0
+    total_weight = 0.0
     for first in range(0, count, CHUNK):
-        some = filled_up(min(CHUNK, count - first))
+        some = pad_to_lanes(min(CHUNK, count - first))
         linearise(p, instants, x0, y0, first, some, w)
-        _add_influence(first, some, w, pull, white, blocks, doubted)
+        _add_influence(first, some, w, response, independent, blocks, shift)
         squares, weight = add_scores(first, some, w, score)
         cost += squares
-        used += weight
+        total_weight += weight
     for axis in range(2):
-        shared = 0.0
+        block_variance = 0.0
         for cell in range(side * side):
-            shared += blocks[axis, cell] ** 2
-        quality[1 + axis] = white[axis]
-        quality[3 + axis] = shared
-        quality[7 + axis] = doubted[axis]
+            block_variance += blocks[axis, cell] ** 2
+        quality[1 + axis] = independent[axis]
+        quality[3 + axis] = block_variance
+        quality[7 + axis] = shift[axis]
     step = score.copy()
     substitute(L, step)
     gain = 0.0
     for i in range(n):
         gain += step[i] * score[i]
         p[i] += step[i]
-    _keep_possible(p, instants)
-    quality[5] = max(cost - gain, 0.0) / max(used - n, 1.0)
-    quality[6] = used / count
+    _clip_edge_variance(p, instants)
+    quality[5] = max(cost - gain, 0.0) / max(total_weight - n, 1.0)
+    quality[6] = total_weight / count
     quality[9] = 0.5 * (size[2] + size[4])
     return max(abs(step[0]), abs(step[1])), cost, gain
 
 
 @njit(**FAST)
 def _number_blocks(count, w):
-    """Fills in which block of a square of them each pixel lies; returns how many blocks the square's side has."""
-    count = min(filled_up(count), LARGEST)
-    most = 0  # a maximum of whole numbers becomes vector instructions, one of floats does not
+    """Fill the index of each pixel's block in a square grid of blocks; returns the blocks along the grid's side."""
+    count = min(pad_to_lanes(count), MAX_PIXELS)
+    farthest = 0  # the compiler vectorises a maximum of integers, but not of floats
     for k in range(count):
-        most = max(most, max(abs(int(w[X + k])), abs(int(w[Y + k]))))
-    scale, side = np.float32(1.0 / BLOCK), 2 * most // BLOCK + 2
-    reach, width = np.float32(most), np.float32(side)
+        farthest = max(farthest, max(abs(int(w[X + k])), abs(int(w[Y + k]))))
+    scale, side = np.float32(1.0 / BLOCK), 2 * farthest // BLOCK + 2
+    reach, width = np.float32(farthest), np.float32(side)
     for k in range(count):
         row, column = np.floor((w[Y + k] + reach) * scale), np.floor((w[X + k] + reach) * scale)
-        w[BLOCK_OF + k] = row * width + column
+        w[BLOCK_INDEX + k] = row * width + column
     return side
 
 
 @njit(**FAST)
-def _add_influence(first, count, w, pull, white, blocks, doubted):
-    """Each pixel's weight in the centre, squared, and times its residual, summed by block and over doubted ones."""
+def _add_influence(first, count, w, response, independent, blocks, shift):
+    """Add a chunk's influence on the centre: its squares, and its products with the residuals.
+
+    The products are summed by block, and over the pixels of reduced weight.
+    """
     count = min(count, CHUNK)
-    first = min(max(first, 0), LARGEST - CHUNK)
+    first = min(max(first, 0), MAX_PIXELS - CHUNK)
     for axis in range(2):
         influence = WEIGHTED + axis * CHUNK
         w[influence : influence + count] = np.float32(0.0)
-        for i in range(0, PARAMETERS, 4):  # four rows at once: what is filled is loaded and stored less often
+        for i in range(0, PARAMETER_COUNT, 4):  # four rows at once: fewer loads and stores
             row = J + i * CHUNK
-            factor0, factor1 = np.float32(pull[axis, i]), np.float32(pull[axis, i + 1])
-            factor2, factor3 = np.float32(pull[axis, i + 2]), np.float32(pull[axis, i + 3])
+            factor0, factor1 = np.float32(response[axis, i]), np.float32(response[axis, i + 1])
+            factor2, factor3 = np.float32(response[axis, i + 2]), np.float32(response[axis, i + 3])
             for k in range(count):
                 value0, value1 = w[row + k], w[row + CHUNK + k]
                 value2, value3 = w[row + 2 * CHUNK + k], w[row + 3 * CHUNK + k]
                 w[influence + k] += factor0 * value0 + factor1 * value1 + factor2 * value2 + factor3 * value3
         total = np.float32(0.0)
-        pulled = np.float32(0.0)
+        reduced = np.float32(0.0)
         for k in range(count):
             w[influence + k] *= w[WEIGHT + first + k]
             total += w[influence + k] * w[influence + k]
             w[influence + k] *= w[J + 12 * CHUNK + k]
-            pulled += w[influence + k] if w[WEIGHT + first + k] < np.float32(DOUBTED) else np.float32(0.0)
-        white[axis] += total
-        doubted[axis] += pulled
+            reduced += w[influence + k] if w[WEIGHT + first + k] < np.float32(REDUCED_WEIGHT) else np.float32(0.0)
+        independent[axis] += total
+        shift[axis] += reduced
     for k in range(count):
-        block = int(w[BLOCK_OF + first + k])
+        block = int(w[BLOCK_INDEX + first + k])
         blocks[0, block] += w[WEIGHTED + k]
         blocks[1, block] += w[WEIGHTED + CHUNK + k]
 
 
 @njit(**FAST)
-def _is_last(length, gain, cost, count):
-    """Whether the step after this one would not be worth its while."""
-    return (length < SETTLED and gain < WORTH * cost) or gain * count < WORTHLESS * cost
+def _is_final(length, gain, cost, count):
+    """Whether the step after this one would gain nothing that matters."""
+    return (length < FINAL_STEP and gain < FINAL_GAIN * cost) or gain * count < NEGLIGIBLE_GAIN * cost
 
 
 @njit(**FAST)
 def minimise(p, instants, x0, y0, count, w, H, L, quality):
-    """Levenberg and Marquardt's steps from p, which is filled with the result, as is quality; False where they fail.
+    """Minimise from p by Levenberg-Marquardt steps; fills p and quality; returns False if it fails.
 
-    H holds the normal equations at p. A step that leaves the normal matrix nearly as it was is followed by another with
-    the same factor, from the look at the pixels that `quality` takes: mostly the last.
+    H holds the normal equations at p. After a step that leaves the normal matrix nearly unchanged, `_assess` takes
+    another with the same factor, in the pass over the pixels that computes `quality`. This is usually the final step.
     """
-    n = PARAMETERS
-    trial, settled = p.copy(), p.copy()
+    n = PARAMETER_COUNT
+    trial, candidate = p.copy(), p.copy()
     step = np.zeros(n)
     damping = 1e-3
     best = np.inf
@@ -182,13 +195,13 @@ def minimise(p, instants, x0, y0, count, w, H, L, quality):
         cost = H[n, n]
         if not cost < np.inf:
             return False
-        if cost > best * (1.0 + 1e-6):  # back, and less far
+        if cost > best * (1.0 + 1e-6):  # go back and take a shorter step
             damping = max(30.0 * damping, 1e-3)
             if damping > 1e4:
                 break
             step *= 0.2
             trial[:] = p + step
-            _keep_possible(trial, instants)
+            _clip_edge_variance(trial, instants)
             continue
         best = cost
         p[:] = trial
@@ -202,21 +215,21 @@ def minimise(p, instants, x0, y0, count, w, H, L, quality):
         for i in range(n):
             gain += step[i] * H[n, i]
         trial[:] = p + step
-        _keep_possible(trial, instants)
+        _clip_edge_variance(trial, instants)
         length = max(abs(step[0]), abs(step[1]))
-        last, close = _is_last(length, gain, best, count), _is_close(p, step)
-        if not (damping < LITTLE and (last or close)):
+        final, small = _is_final(length, gain, best, count), _is_small(p, step)
+        if not (damping < MAX_FINAL_DAMPING and (final or small)):
             continue
-        settled[:] = trial
+        candidate[:] = trial
         length, cost, gain = _assess(trial, instants, x0, y0, count, w, L, quality)
-        risen = RISEN if close and length < RESTING else LEVEL
-        if cost < best * (1.0 + risen) and (last or _is_last(length, gain, cost, count)):
+        increase = ACCEPTED_INCREASE if small and length < SHORT_STEP else ROUNDING_INCREASE
+        if cost < best * (1.0 + increase) and (final or _is_final(length, gain, cost, count)):
             p[:] = trial
             return True
-        trial[:] = settled
-    # Where rounding hides what is left to gain, or along what the pixels hardly tell.
+        trial[:] = candidate
+    # Rounding hides the remaining gain, or some parameters are poorly determined.
     normal_equations(p, instants, x0, y0, count, w, H)
-    if not factorise(H, MUCH, L):
+    if not factorise(H, FALLBACK_DAMPING, L):
         return False
     length, cost, gain = _assess(p, instants, x0, y0, count, w, L, quality)
-    return _is_last(length, gain, cost, count)
+    return _is_final(length, gain, cost, count)
