@@ -43,7 +43,7 @@ frame. First frame fit: root mean square distance between the markers of the fit
 <table><tr><th>marker</th>{% for name in names %}<th>{{ name }}</th>{% endfor %}</tr>
 {% for row in residuals %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 <h2>Registration</h2>
-<p class="note">Distance of each marker used from its layout position [mm]; standard deviation of the pose.</p>
+<p class="note">Distance of each marker used from its layout position [mm]; sigma of the pose.</p>
 <ul>{% for line in registrations %}<li>{{ line }}</li>{% endfor %}</ul></html>
 """
 

@@ -280,7 +280,7 @@ def _release_and_source(position: Array, row: RecordingRow, settings: CaptureSet
 
 
 def _marker_velocity(position: Array, sigma: Array, time: Array, start: int) -> tuple[Array, Array]:
-    """Marker velocities in a frame and their standard deviations [m/s], (M, 3), by polynomials through near frames."""
+    """Marker velocities in a frame and their sigmas [m/s], (M, 3), by polynomials through near frames."""
     end = min(max(start + VELOCITY_WINDOW_FRAMES, 2 * VELOCITY_WINDOW_FRAMES), len(time) - 1)
     near = slice(max(start - VELOCITY_WINDOW_FRAMES, 0), end + 1)
     powers = np.vander(time[near] - time[start], 2 * VELOCITY_WINDOW_FRAMES + 1, increasing=True)

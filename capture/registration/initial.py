@@ -14,7 +14,7 @@ from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-# Prior standard deviations of a nodal force [N]. The linear part varies linearly over the nodes (a force and a
+# Prior sigmas of a nodal force [N]. The linear part varies linearly over the nodes (a force and a
 # moment). The local part is the rest, which would dent the mesh to match single markers. It is fitted three times:
 # practically without it, with little of it, and with more, which is kept if it halves the remaining residual.
 LINEAR_FORCE_SIGMA, LOCAL_FORCE_SIGMAS = 1.0, (1e-5, 5e-3, 5e-2)
@@ -36,7 +36,7 @@ class FirstFrame:
         markers: embedded in its mesh.
         nodes: nodes on which virtual forces act, (L).
         target: recorded marker positions [m], (M, 3), NaN where missing.
-        sigma: their standard deviations [m], (M, 3); equal along all axes if the pose is fitted too.
+        sigma: of the target [m], (M, 3); equal along all axes if the pose is fitted too.
         recording: name, for messages.
         whole_surface: whether `nodes` are the whole surface, each with an independent force.
     """
@@ -130,8 +130,8 @@ class _LevenbergMarquardt:
     Args:
         frame: observation.
         with_pose: whether the pose is fitted too.
-        local_sigma: prior standard deviation of the local part of the forces [N].
-        model_sigma: standard deviation of the difference between mesh and specimen [m].
+        local_sigma: prior sigma of the local part of the forces [N].
+        model_sigma: of the difference between mesh and specimen [m].
     """
 
     def __init__(self, frame: FirstFrame, with_pose: bool, local_sigma: float, model_sigma: float) -> None:
@@ -219,7 +219,7 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
     Args:
         frame: observation, and the nodes on which forces act.
         q: the mesh in the first frame [m], (N, 3).
-        velocity, sigma: of the markers and their standard deviations [m/s], (M, 3); NaN and infinite if unknown.
+        velocity, sigma: velocities of the markers and their sigmas [m/s], (M, 3); NaN and infinite if unknown.
     """
     jacobian = marker_jacobian(frame, q)
     known = np.isfinite(velocity[frame.measured]).ravel() & np.isfinite(sigma[frame.measured]).ravel()

@@ -16,7 +16,7 @@ class Recording:
         names: of the markers, (M); None if the file has none.
         time: [s], (T).
         position: [m], (T, M, 3), NaN where missing.
-        sigma: standard deviation [m], (T, M, 3).
+        sigma: [m], (T, M, 3).
         rest: positions of the undeformed specimen in the same frame [m], (M, 3), if recorded.
         in_specimen_frame: whether a calibration has put the positions into the specimen frame.
         source: file name and SHA-256.

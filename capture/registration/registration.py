@@ -94,7 +94,7 @@ def fit_rest(recording: Recording, rest_pose: RestPose, specimen: Specimen, tole
 
 
 def average_frames(position: Array, sigma: Array) -> tuple[Array, Array]:
-    """Weighted mean over frames and its standard deviation [m], (M, 3).
+    """Weighted mean over frames and its sigma [m], (M, 3).
 
     Averaging reduces only the part of the variance that is seen as scatter between the frames; the rest of sigma is
     systematic and stays.

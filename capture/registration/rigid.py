@@ -47,7 +47,7 @@ class RigidTransform:
         return RigidTransform(self.rotation[chosen], self.translation[chosen])
 
     def rotate_sigma(self, sigma: Array) -> Array:
-        """Standard deviations (..., M, 3) along the rotated axes; correlations between axes are ignored."""
+        """Sigmas (..., M, 3) along the rotated axes; correlations between axes are ignored."""
         return np.asarray(np.sqrt(sigma**2 @ np.swapaxes(self.rotation, -1, -2) ** 2))
 
 
@@ -108,7 +108,7 @@ def fit_pose(points: Array, layout: Array, sigma: Array) -> RigidFit:
     Args:
         points: recorded positions [m], (M, 3), NaN where missing; at least three, not collinear.
         layout: layout positions [m], (M, 3).
-        sigma: standard deviations of the recorded positions along the recorded axes [m], (M, 3).
+        sigma: of the recorded positions along the recorded axes [m], (M, 3).
     """
     measured = np.flatnonzero(np.isfinite(points[:, 0]))
     used = measured
@@ -170,7 +170,7 @@ def fit_clamp_poses(points: Array, layout: Array, sigma: Array) -> tuple[RigidTr
     Args:
         points: recorded positions [m], (T, M, 3), NaN where missing; at least one frame has three.
         layout: layout positions [m], (M, 3).
-        sigma: standard deviations [m], (T, M, 3).
+        sigma: [m], (T, M, 3).
 
     Returns:
         Transforms of T frames, and distances [m], (T, M), NaN where missing.

@@ -26,7 +26,7 @@ class Trajectory:
         time: [s], (T).
         markers: positions [m], (T, M, 3), NaN where not valid.
         valid: whether a marker was observed, (T, M).
-        sigma: one standard deviation [m], (T, M, 3); infinite where an axis was not observed.
+        sigma: [m], (T, M, 3); infinite where an axis was not observed.
         q, v: initial mesh positions [m] and velocities [m/s], (N, 3).
         virtual_force: nodal forces that balance the first frame; they vanish at the release [N], (N, 3).
         load: constant nodal forces during the motion, without gravity [N], (N, 3).

@@ -12,7 +12,7 @@ import torch
 import yaml
 
 from rafl.common.errors import InputError
-from rafl.common.files import require_file, atomic_file, write_text
+from rafl.common.files import atomic_file, require_file, write_text
 from rafl.common.yaml_files import check_format, read_yaml_content
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.global_residual import GlobalResidual

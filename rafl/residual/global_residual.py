@@ -8,7 +8,7 @@ from rafl.simulation.rollout import ResidualForce
 from rafl.simulation.simulator import Simulator
 
 WIDTH, BLOCKS, LAYERS = 512, 5, 3  # units per layer, residual blocks, layers per block
-MIN_RELATIVE_DEVIATION = 0.05  # smallest standard deviation for normalisation, relative to the largest of its kind
+MIN_RELATIVE_DEVIATION = 0.05  # smallest sigma for normalisation, relative to the largest of its kind
 
 
 class _Block(nn.Module):
@@ -36,7 +36,7 @@ class GlobalResidual(nn.Module):
 
     With displacements as input, a stretched mesh at rest is the same state as the training mesh at rest, and the errors
     on stretched beams are those of the paper. With positions as input they are up to six times as large. Inputs and
-    outputs are normalised by their means and standard deviations over the training states.
+    outputs are normalised by their means and sigmas over the training states.
 
     Args:
         nodes: number of vertices N.
@@ -58,7 +58,7 @@ class GlobalResidual(nn.Module):
             self.register_buffer(name, start(size * nodes))
 
     def set_normalisation(self, motion: Tensor, forces: Tensor) -> None:
-        """Set means and standard deviations from training inputs (S, 6 N) and forces (S, 3 N)."""
+        """Set means and sigmas from training inputs (S, 6 N) and forces (S, 3 N)."""
         displacements, velocities = motion.chunk(2, dim=1)
         # The lower bound keeps the normalisation from amplifying components that hardly vary.
         sizes = [

@@ -40,14 +40,14 @@ class Dots:
 
     Attributes:
         centre: [px], (D, 2).
-        sigma: standard deviation of the centre along x and y, from the fit's residual and the shift that pixels of
+        sigma: of the centre along x and y, from the fit's residual and the shift that pixels of
             reduced weight cause [px], (D, 2); NaN where the fit failed.
         parameters: of the fitted discs, see `rafl.tracking.detection.disc_model`, (D, 12).
         radius: geometric mean of the semi-axes [px], (D).
-        relative_radius_sigma: standard deviation of the radius over the radius; large for small defocused dots, (D).
+        relative_radius_sigma: of the radius over the radius; large for small defocused dots, (D).
         axis_ratio: minor over major semi-axis, 1 for a circle, (D).
         contrast: level of the dot minus that of its surroundings, negative for dark dots [grey levels], (D).
-        noise_gain: centre's standard deviation for independent noise of one grey level in every pixel,
+        noise_gain: centre's sigma for independent noise of one grey level in every pixel,
             sqrt(sum over pixels k of (d centre / d level_k)^2) [px per grey level], (D, 2).
         residual: root mean square residual over |contrast|, (D).
         misfit: the same without the pixel noise, which is estimated only where the residual is large, (D).
@@ -81,7 +81,7 @@ class Dots:
 
     @property
     def blur(self) -> Array:
-        """Standard deviation of the edge where it is sharpest, thus without motion blur [px], (D)."""
+        """Sigma of the edge where it is sharpest, thus without motion blur [px], (D)."""
         xx, xy, yy = self.parameters[:, 5:8].T
         return np.asarray(np.sqrt(np.maximum(0.5 * (xx + yy) - np.hypot(0.5 * (xx - yy), xy), MIN_EDGE_VARIANCE)))
 

@@ -30,7 +30,7 @@ from rafl.tracking.detection.normal_equations import add_products, normal_equati
 
 OUTLIER_RESIDUAL = 0.12  # fraction of the contrast: a pixel with a larger residual shows something else than the dot
 LEVEL_TOLERANCE = 0.2  # fraction of the contrast: a level this far from those of the start gets half the weight
-NOISE_SIGMAS = 3.5  # standard deviations of the pixel noise: lower limit of the level tolerance
+NOISE_SIGMAS = 3.5  # sigmas of the pixel noise: lower limit of the level tolerance
 MIN_NOISE_RESIDUAL = 0.1  # fraction of the contrast: the pixel noise is estimated only for larger residuals
 MIN_LIGHT_CHANGE = 0.05  # logarithm: a smaller change of the light does not matter
 MAX_UNEXPLAINED = 0.5  # fraction of the unexplained pixels that may remain where a change of the light explains them
@@ -40,7 +40,7 @@ LOW_WEIGHT = 0.3  # a pixel of less weight counts as unexplained
 # one runs depends on whether they were compiled in this process or loaded from the cache. The start's unexplained
 # pixels depend on the last bit.
 STRICT: dict[str, Any] = FAST | {"fastmath": {"nsz"}}
-WIDENING_SIGMAS = 1.2  # standard deviations of the edge: what occludes the dot is blurred as well
+WIDENING_SIGMAS = 1.2  # sigmas of the edge: what occludes the dot is blurred as well
 MAX_SHORT_MOTION = 0.4  # fraction of the radius: a longer motion during the exposure is no blurred edge
 
 
@@ -74,7 +74,7 @@ def _reweight(p, instants, x0, y0, count, unexplained, tolerance, w):
 
 @njit(**FAST)
 def _robust_scale(max_flat, count, w):
-    """Standard deviation of the residuals, by their median: of pixels at the outline (max_flat 0) or of all (1)."""
+    """Sigma of the residuals, by their median: of pixels at the outline (max_flat 0) or of all (1)."""
     count = min(count, MAX_PIXELS)
     found = 0
     for k in range(count):
@@ -232,7 +232,7 @@ def _weigh_by_levels(p, x0, y0, count, tolerance, w, H):
 
 @njit(**FAST)
 def _pixel_noise(row, count, w):
-    """Standard deviation of the noise, by the median difference of horizontally adjacent pixels in row `row` of w."""
+    """Sigma of the noise, by the median difference of horizontally adjacent pixels in row `row` of w."""
     count = min(count, MAX_PIXELS)
     found = 0
     for k in range(1, count):

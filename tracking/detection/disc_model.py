@@ -33,12 +33,12 @@ J = 8 * MAX_PIXELS  # a chunk's derivatives by the parameters, 12 rows, and its 
 WEIGHTED = J + 13 * CHUNK  # two rows
 SCRATCH_SIZE = WEIGHTED + 2 * CHUNK
 MIN_EDGE_VARIANCE, MAX_EDGE_VARIANCE = 0.08, 40.0  # px^2: of W along any direction
-# A fit uses the pixels within a margin of the outline: MARGIN_EDGE_SIGMAS standard deviations of the blurred edge, plus
+# A fit uses the pixels within a margin of the outline: MARGIN_EDGE_SIGMAS sigmas of the blurred edge, plus
 # MARGIN_RADII radii. The first part is at most MAX_MARGIN (fraction of the radius, plus px), or MOTION_END_SIGMAS
-# standard deviations past the end of the motion, if that is more. Farther out, the edge of a sticker that the dot is on
+# sigmas past the end of the motion, if that is more. Farther out, the edge of a sticker that the dot is on
 # would pass for the dot's blur.
 MARGIN_EDGE_SIGMAS, MARGIN_RADII, MAX_MARGIN, MOTION_END_SIGMAS = 3.0, 0.3, (0.5, 5.0), 1.5
-PROFILE_SUPPORT = 4.0  # standard deviations: half the bell curve's support
+PROFILE_SUPPORT = 4.0  # sigmas: half the bell curve's support
 
 # The bell (1 - z^2 / 16)^8 on |z| < 4 is close to exp(-z^2 / 2) and integrates to an odd polynomial.
 _SERIES = np.array([comb(8, k) * (-1.0 / 16.0) ** k / (2 * k + 1) for k in range(9)])

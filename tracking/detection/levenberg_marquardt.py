@@ -32,7 +32,7 @@ QUALITY_COUNT = 12
 # A step within these three limits leaves the normal matrix nearly unchanged.
 SMALL_SHIFT = 1.0  # px: of the centre
 SMALL_RADIUS_CHANGE = 0.3  # px
-SMALL_RELATIVE_CHANGE = 0.05  # of the contrast and of the edge's standard deviation
+SMALL_RELATIVE_CHANGE = 0.05  # of the contrast and of the edge's sigma
 MAX_FINAL_DAMPING = 1e-3  # of the normal matrix's diagonal: less changes neither the steps nor the variances much
 # A step within these two limits is the last but one: the next would be smaller still.
 FINAL_STEP = 0.005  # px: of the centre

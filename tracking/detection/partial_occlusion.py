@@ -18,17 +18,17 @@ Array = NDArray[Any]
 
 # A dot's own change of a half width counts as an occlusion above the largest of these four limits.
 MIN_CHANGE = 0.025  # fraction of the half width
-RADIUS_SIGMAS = 4.0  # standard deviations of the radius
-CENTRE_SIGMAS = 4.0  # standard deviations of the centre
-SCATTER_SIGMAS = 5.0  # standard deviations of the dot's own changes so far
+RADIUS_SIGMAS = 4.0  # sigmas of the radius
+CENTRE_SIGMAS = 4.0  # sigmas of the centre
+SCATTER_SIGMAS = 5.0  # sigmas of the dot's own changes so far
 MAX_CHANGE = 0.1  # fraction of the half width: a dot that changed more counts as missing
-INITIAL_SCATTER = 0.01  # fraction of the half width: standard deviation of a dot's own changes, at first
-MAX_SCATTER_STEP = 2.5  # standard deviations: a larger change updates the scatter as this one does
+INITIAL_SCATTER = 0.01  # fraction of the half width: sigma of a dot's own changes, at first
+MAX_SCATTER_STEP = 2.5  # sigmas: a larger change updates the scatter as this one does
 MIN_OBSERVATIONS = 5  # of a marker before it is judged
 LEARNING_RATE = 0.1  # fraction of a change that the usual outline takes over in each frame
 OCCLUDED_LEARNING_RATE = 0.03  # the same of a dot that seems occluded
 CENTRE_SHIFT_FACTOR = 1.5  # possible shift of the centre along an axis over the half width lost or gained along it
-GRADIENT_SIGMA = 0.03  # fraction of the half width: standard deviation of the change's gradient along the body
+GRADIENT_SIGMA = 0.03  # fraction of the half width: sigma of the change's gradient along the body
 OUTLIER_SCALE = 0.02  # fraction of the half width: a change this far from the common one gets half the weight
 ROUNDS = 6  # of reweighting
 

@@ -17,7 +17,7 @@ from rafl.tracking.detection.detect import CORRELATED_VARIANCE_RATIO, Dots, fit_
 
 Array = NDArray[Any]
 
-EDGE_SIGMAS = 3.0  # standard deviations of the blurred edge: this much of it belongs to the outline
+EDGE_SIGMAS = 3.0  # sigmas of the blurred edge: this much of it belongs to the outline
 VIEW_RADII = 3.0  # a view reaches this many radii from the dot's centre
 VIEW_MARGIN = 10.0  # px: and this much farther
 REMAINING_ERROR = 1.0 / 3.0  # fraction of the correction: the dot may have turned or come nearer since the view

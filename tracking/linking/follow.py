@@ -35,7 +35,7 @@ class PixelTracks:
         time: [s], (T), NaN where the video gives none.
         pixel: positions [px], (T, D, 2), NaN where not measured. If the quantisation step is known, they are corrected
             by the other markers' motion.
-        sigma: one standard deviation along x and y [px], (T, D, 2).
+        sigma: along x and y [px], (T, D, 2).
         start: positions in the first frame that shows markers [px], (D, 2); predicted for late-detected markers.
         late_count: number of late-detected markers, which are the last ones.
         damaged: frames that could not be decoded, (T).

@@ -65,7 +65,7 @@ class LateMarker:
 
     Attributes:
         rest: its position in the marker pattern [px], (2).
-        sigma: standard deviation of `rest` along x and along y [px].
+        sigma: of `rest` along x and along y [px].
         parameters: of its disc, (12).
         seen: its position and sigma [px], (2) each, by frame, up to the present one.
     """
@@ -91,7 +91,7 @@ class LateMarkerFinder:
 
     Attributes:
         appearance: of the markers.
-        rest_sigma: standard deviation of each known marker's position in the pattern [px], (M).
+        rest_sigma: of each known marker's position in the pattern [px], (M).
     """
 
     appearance: MarkerAppearance

@@ -20,7 +20,7 @@ ITERATIONS = 3  # of matching and fitting, for each shape
 FIRST_GATE, LAST_GATE = 0.5, 0.25  # most distance of a dot from its marker, in the first and last iteration [spacings]
 MAX_LOG_DEFICIT = 12.0  # a hypothesis is likely if its log density is at most this much below the best one's
 MAX_MEAN_SQUARE = 4.0  # the best hypothesis is rejected if the mean square of its residuals is larger
-DOT_SIGMA = 0.05  # standard deviation of a dot's position, besides the predicted one [spacings]
+DOT_SIGMA = 0.05  # of a dot's position, besides the predicted one [spacings]
 GATE_SIGMAS, GATE_SPACINGS = 4.0, 0.5  # most distance of a marker's own dot from its predicted position
 MIN_LOG_RATIO = 9.0  # least twice the log density ratio of a dot's marker and any other marker
 

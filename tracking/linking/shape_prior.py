@@ -10,7 +10,7 @@ x (2 M values) are modelled as normally distributed, x = mean + W a + e:
   scale falls as the number of known shapes grows.
 - e is independent noise.
 
-Conditioning on the visible markers gives the position and standard deviation of the hidden ones.
+Conditioning on the visible markers gives the position and sigma of the hidden ones.
 """
 
 from typing import Any, NamedTuple
@@ -29,12 +29,12 @@ NEAREST_SHAPES = 8  # shapes whose mean and differences give the local model
 SHAPE_MODE_SCALE = 4.0  # factor on the differences between the nearest shapes: an extrapolation this far is normal
 MAX_STRETCH_MODES = 32
 MIN_VARIANCE_RATIO = 1e-8  # of a stretching mode, relative to the largest
-RIGID_SIGMA = 5.0  # standard deviation of translation and rotation [units]; that of bending is much smaller
+RIGID_SIGMA = 5.0  # of translation and rotation [units]; that of bending is much smaller
 BENDING_DEGREES = 6  # polynomial degrees, from 0, of the bending modes
-STRETCH_SIGMA, STRETCH_LENGTH = 0.4, 5.0  # standard deviation and correlation length of stretching and shear [units]
+STRETCH_SIGMA, STRETCH_LENGTH = 0.4, 5.0  # sigma and correlation length of stretching and shear [units]
 RIGID_HALVING_SHAPES, OTHER_HALVING_SHAPES = 5.0, 10.0  # known shapes after which a generic mode's scale has halved
 MIN_CHANGE = 0.1  # displacement of any marker since the last kept shape that makes a new one [units]
-NOISE_SIGMA = 0.01  # standard deviation of e [units]
+NOISE_SIGMA = 0.01  # of e [units]
 CLUTTER_SIDE = 8.0  # side of the square in which an arbitrary dot may lie [units]
 
 
@@ -43,7 +43,7 @@ class PredictedPosition(NamedTuple):
 
     Attributes:
         position: [px], (M, 2).
-        sigma: standard deviation along x and along y [px], (M); infinite where nothing is known.
+        sigma: along x and along y [px], (M); infinite where nothing is known.
     """
 
     position: Array
@@ -72,7 +72,7 @@ class ShapePrior:
         return len(self._shapes)
 
     def _bending_modes(self) -> Array:
-        """Modes of translation, rotation, scaling and bending, times their standard deviations [px], (2 M, K).
+        """Modes of translation, rotation, scaling and bending, times their sigmas [px], (2 M, K).
 
         They are conformal: rows of markers stay perpendicular to columns. Each is a Chebyshev polynomial of the complex
         position along (real part) and across (imaginary part) the body's long axis.
@@ -91,7 +91,7 @@ class ShapePrior:
         return np.stack([np.stack([mode.real, mode.imag], axis=1).ravel() for mode in modes], axis=1)
 
     def _stretching_modes(self) -> Array:
-        """Modes of smooth stretching and shear, times their standard deviations [px], (2 M, K)."""
+        """Modes of smooth stretching and shear, times their sigmas [px], (2 M, K)."""
         square = ((self._rest[:, None] - self._rest[None]) ** 2).sum(axis=2)
         variance, modes = np.linalg.eigh(np.exp(-0.5 * square / (STRETCH_LENGTH * self._unit) ** 2))
         variance, modes = variance[-MAX_STRETCH_MODES:], modes[:, -MAX_STRETCH_MODES:]

@@ -17,7 +17,7 @@ Array = NDArray[Any]
 MAX_STATIC_DISPLACEMENT = 0.05  # a static dot was never farther than this from its first position [spacings]
 # A still dot is static if the moving markers predict it this far from its first position:
 MIN_DEVIATION_SPACINGS = 0.5
-MIN_DEVIATION_SIGMAS = 4.0  # standard deviations of the prediction
+MIN_DEVIATION_SIGMAS = 4.0  # sigmas of the prediction
 RECHECK_RATIO = 1.3  # growth of the largest displacement of any marker after which the dots are checked again
 MIN_MOVING_MARKERS = 4  # needed to predict the still ones
 

@@ -2,7 +2,7 @@
 
 A dot found where the motion so far predicts a marker is that marker's dot. Where the motion cannot be predicted, all
 dots are matched to the markers at once by their pattern. A marker that reappears is accepted only if its dot can belong
-to no other marker. The shape prior predicts its position and the standard deviation of that.
+to no other marker. The shape prior predicts its position and the sigma of that.
 """
 
 from dataclasses import replace
@@ -67,7 +67,7 @@ class Tracker:
         self.prior = ShapePrior(first.centre)
         self.static_dots = StaticDots(len(first))
         self.frames_missing = np.zeros(len(first), dtype=np.int64)  # since each marker was last visible
-        self.sigma = np.zeros(len(first))  # standard deviation of each marker's position; 0 if identified [px]
+        self.sigma = np.zeros(len(first))  # sigma of each marker's position; 0 if identified [px]
         self.frames_since_search = 0
         self.late_markers = LateMarkerFinder(appearance, np.zeros(len(first)))
         self.complete_views = CompleteViews.empty(len(first))

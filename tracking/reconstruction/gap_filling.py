@@ -29,7 +29,7 @@ def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple
 
     Args:
         position: [m], (T, M, 3), NaN where missing.
-        sigma: standard deviation [m], (T, M, 3).
+        sigma: [m], (T, M, 3).
         time: [s], (T).
         longest: longest gap to fill [frames].
 
@@ -144,7 +144,7 @@ def _interpolate_path(
 ) -> tuple[Array, Array]:
     """Positions (G, 3) on a cubic spline through the frames around, and their variances (G, 3).
 
-    The standard deviation is half the distance between the spline and the chord across the gap.
+    The sigma is half the distance between the spline and the chord across the gap.
     """
     around = frames[np.abs(frames - 0.5 * (before + after)) < 40]
     around = around if len(around) >= 4 else frames

@@ -24,17 +24,17 @@ PER_CAMERA_ARRAYS = ("pixel", "residual", "pixel_sigma", "damaged", "frame")
 
 @dataclass(frozen=True)
 class Tracks:
-    """Markers of one recording, in the world frame.
+    """Markers of one recording, in the world frame. A `sigma` is one standard deviation of the error.
 
     Attributes:
         names: of the markers, (M).
         time: [s], (T).
         position: [m], (T, M, 3), NaN where missing.
-        sigma: standard deviation of the position [m], (T, M, 3).
+        sigma: of the position [m], (T, M, 3).
         state: 0 missing, 1 measured, 2 filled, (T, M).
         pixel: by camera, (T, M, 2) [px], NaN where not seen.
         residual: reprojection residual by camera, (T, M) [px].
-        pixel_sigma: standard deviation of each pixel coordinate by camera, (T, M, 2) [px].
+        pixel_sigma: of each pixel coordinate by camera, (T, M, 2) [px].
         damaged: by camera, whether the frame could not be decoded, (T).
         frame: by camera, the number in its video of the frame shown at each time, -1 for none, (T).
         images: by camera, the first and the worst frames, by frame number, as JPEG.
@@ -77,8 +77,9 @@ class Tracks:
         return {number: row for row, number in reversed(list(enumerate(self.frame[camera].tolist())))}
 
 
-def write_tracks(path: Path, tracks: Tracks) -> None:
+def write_tracks(path: str | Path, tracks: Tracks) -> None:
     """Write a tracks file, completely or not at all."""
+    path = Path(path)
     sources = [f"{digest}  {name}" for name, digest in tracks.sources.items()]
     with atomic_file(path) as temporary, h5py.File(temporary, "w") as file:
         file.attrs.update(
@@ -103,12 +104,13 @@ def write_tracks(path: Path, tracks: Tracks) -> None:
                 file[f"cameras/{name}/pictures/{number}"] = np.frombuffer(image, np.uint8)
 
 
-def read_tracks(path: Path) -> Tracks:
+def read_tracks(path: str | Path) -> Tracks:
     """Read a tracks file.
 
     Raises:
         InputError: the file is missing, no tracks file, of a newer version, or damaged.
     """
+    path = Path(path)
     require_file(path, "a tracks file (.h5)")
     try:
         with h5py.File(path, "r") as file:

@@ -14,7 +14,7 @@ from rafl.common.errors import InputError
 Array = NDArray[Any]
 
 SAME_TIME_FRAMES = 0.02  # times that differ by less than this need no interpolation [frame intervals]
-# A camera is an outlier if its residual exceeds so many standard deviations plus so many pixels.
+# A camera is an outlier if its residual exceeds so many sigmas plus so many pixels.
 OUTLIER_SIGMAS, OUTLIER_PIXELS = 6.0, 1.5
 MAX_ITERATIONS = 8  # of Gauss-Newton; a pinhole camera's equations are not quite linear
 
@@ -25,7 +25,7 @@ class CameraPixels:
 
     Attributes:
         pixel: (T, M, 2), NaN where not seen.
-        sigma: standard deviation of each coordinate [px], (T, M, 2), NaN where not seen.
+        sigma: of each coordinate [px], (T, M, 2), NaN where not seen.
     """
 
     pixel: Array
@@ -126,7 +126,7 @@ def _count(seen: dict[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Positions and their standard deviations [m], (T, M, 3), NaN where no camera sees the marker."""
+    """Positions and their sigmas [m], (T, M, 3), NaN where no camera sees the marker."""
 
     position: Array
     sigma: Array

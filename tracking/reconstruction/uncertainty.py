@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[Any]
 
-# Compression error. Along an axis in which the marker does not move, its standard deviation is STATIC_FACTOR times that
+# Compression error. Along an axis in which the marker does not move, its sigma is STATIC_FACTOR times that
 # of the fit, which assumes that the errors of neighbouring pixels are independent. Along the marker's path, where the
 # encoder lets it lag, it is LAG_COEFFICIENT * e**LAG_EXPONENT [px]; e [px] is the error that independent errors of one
 # quantisation step in each pixel would cause. Measured on 115 videos: libx264, crf 12 to 28, medium preset, noise of
@@ -48,7 +48,7 @@ MAX_SIGMAS = 3.0  # from the predicted position: a marker farther off moves on i
 
 
 def noise_fraction(uncorrelated_residual: Array, residual: Array) -> float:
-    """The share of the fits' standard deviations that is noise. The rest moves along with the dots.
+    """The share of the fits' sigmas that is noise. The rest moves along with the dots.
 
     A dot that is no perfect disc leaves residuals that neighbouring pixels share. In compressed frames, the part of the
     residual that they do not share is 0.6 to 1 of the whole for discs, and 0.45 to 0.55 for hand-drawn dots almost
@@ -65,15 +65,15 @@ def noise_fraction(uncorrelated_residual: Array, residual: Array) -> float:
 def filtered_positions(
     pixel: Array, fit_sigma: Array, noise_gain: Array, step: Array, lag_factor: Array, noise: float
 ) -> tuple[Array, Array]:
-    """The markers' positions and standard deviations [px], (T, D, 2) each, after all frames have been seen.
+    """The markers' positions and sigmas [px], (T, D, 2) each, after all frames have been seen.
 
     Positions change only if the quantisation steps are known. Each marker is then moved towards the position that the
     other markers' motion predicts. The weight follows from the compression error and the marker's own irregular motion.
 
     Args:
         pixel: paths as fitted [px], (T, D, 2), NaN where not seen.
-        fit_sigma: standard deviations from the fits [px], (T, D, 2).
-        noise_gain: standard deviation of a fitted centre for independent noise of one grey level in each pixel
+        fit_sigma: from the fits [px], (T, D, 2).
+        noise_gain: sigma of a fitted centre for independent noise of one grey level in each pixel
             [px / grey level], (T, D, 2), NaN where not known.
         step: quantisation step at the marker [grey levels], (T, D). NaN where not known: as in other frames.
         lag_factor: by which the encoder preset makes slow motion coarser than the step says, in each frame, (T).
@@ -128,7 +128,7 @@ def preset_factors(pixel: Array, noise_gain: Array, step: Array, lag_factor: Arr
 
 
 def compression_errors(pixel: Array, noise_sigma: Array, noise_gain: Array, step: Array) -> Array:
-    """Expected standard deviations of the compression error [px], (T, D, 2); 0 where nothing is known.
+    """Expected sigmas of the compression error [px], (T, D, 2); 0 where nothing is known.
 
     An encoder skips changes smaller than its quantisation step. A dot that moves a little then stays where it was,
     with a clean image, so that the fit does not show the error. The dot lags along its path, and along each axis in
@@ -136,7 +136,7 @@ def compression_errors(pixel: Array, noise_sigma: Array, noise_gain: Array, step
 
     Args:
         pixel: as in `filtered_positions`.
-        noise_sigma: part of the fits' standard deviations that is noise [px], (T, D, 2).
+        noise_sigma: part of the fits' sigmas that is noise [px], (T, D, 2).
         noise_gain: as in `filtered_positions`.
         step: quantisation steps times `preset_factors`, all known [grey levels], (T, D).
     """
@@ -191,7 +191,7 @@ class LowRankPrediction:
 
     @classmethod
     def of(cls, pixel: Array, sigma: Array) -> "LowRankPrediction | None":
-        """From paths and their standard deviations [px], (T, D, 2); None if there are too few frames or markers."""
+        """From paths and their sigmas [px], (T, D, 2); None if there are too few frames or markers."""
         seen = np.isfinite(sigma[..., 0])
         markers = np.flatnonzero(seen.mean(axis=0) > 0.8)
         frames = np.flatnonzero(seen[:, markers].all(axis=1)) if len(markers) else np.zeros(0, int)
@@ -283,9 +283,9 @@ def _leave_one_out_modes(square: Array, modes: Array, product: Array) -> tuple[A
 
 
 def add_unmodelled_error(sigma: Array, prediction: LowRankPrediction) -> Array:
-    """Standard deviations [px], (T, D, 2), that include the part of the prediction's residuals that `sigma` lacks.
+    """Sigmas [px], (T, D, 2), that include the part of the prediction's residuals that `sigma` lacks.
 
-    A few positions with large residuals change only their own standard deviations.
+    A few positions with large residuals change only their own sigmas.
     """
     index = _index(prediction.frames, prediction.markers, sigma)
     own = (sigma[index] ** 2).mean(axis=0)
@@ -304,16 +304,16 @@ def add_unmodelled_error(sigma: Array, prediction: LowRankPrediction) -> Array:
 def compression_correction(
     pixel: Array, noise_sigma: Array, compression: Array, prediction: LowRankPrediction, coarseness: Array
 ) -> tuple[Array, Array]:
-    """The part of the positions that is compression error, and standard deviations without it [px], (T, D, 2) each.
+    """The part of the positions that is compression error, and sigmas without it [px], (T, D, 2) each.
 
     The corrected position is the weighted mean of the measured and the predicted one, by their variances. The error
     that all markers share cannot be seen, and stays. Where nothing is known of the compression, the correction is zero
-    and the standard deviation NaN.
+    and the sigma NaN.
 
     Args:
         pixel: paths as fitted [px], (T, D, 2).
-        noise_sigma: part of the fits' standard deviations that is noise [px], (T, D, 2).
-        compression: standard deviations of the compression error [px], (T, D, 2).
+        noise_sigma: part of the fits' sigmas that is noise [px], (T, D, 2).
+        compression: sigmas of the compression error [px], (T, D, 2).
         prediction: of these paths.
         coarseness: `step_to_noise_ratio` times `preset_factors`, (T, D).
     """
