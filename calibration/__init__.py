@@ -1,1 +1,1 @@
-"""Camera models, rigs and their calibration from pictures of a board."""
+"""Camera models, rigs and their calibration from board images."""

@@ -1,107 +1,112 @@
-"""The pictures of a board that a folder holds: which camera took which, and the views they show."""
+"""Board images in a folder: their cameras, and the views of the board that they show."""
 
 from pathlib import Path
 
 from rafl.calibration.board import BoardFile, View, find_board
-
 from rafl.common.command_line import progress
 from rafl.common.errors import InputError
 
-PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 
 Views = dict[str, list[View]]
 Sizes = dict[str, tuple[int, int]]
 
 
 def board_views(images: Path, description: BoardFile) -> tuple[Views, Sizes]:
-    """The board in every picture, by camera, and the size of each camera's pictures [px].
+    """Views of the board by camera, and the image size of each camera [px].
 
-    A camera is a sub-folder of `images`, or `images` itself where it has none.
+    Each subfolder of `images` is a camera. Without subfolders, `images` itself is one camera.
 
     Raises:
-        InputError: no pictures, one that cannot be read, of different sizes, or not among those that the description
-            names.
+        InputError: there are no images, an image cannot be read, a camera's images differ in size, or the description
+            names an image that is not there.
     """
     if not images.is_dir():
-        raise InputError(f"expected a folder of board pictures at {images}, found none; check the path")
-    pictures = _pictures(images)
-    _known_pictures(description, pictures, images)
+        raise InputError(f"expected a folder of board images at {images}, found none; check the path")
+    paths = _image_paths(images)
+    _check_named_images(description, paths, images)
     views, sizes = {}, {}
-    for name, names in pictures.items():
-        views[name], sizes[name] = _views(name, names, description)
+    for name, own in paths.items():
+        views[name], sizes[name] = _find_views(name, own, description)
     return views, sizes
 
 
-def check_placed(views: Views) -> None:
-    """Refuses several cameras that nothing ties to one world.
+def check_shared_world(views: Views) -> None:
+    """Check that all cameras can be calibrated in one world frame.
 
     Raises:
-        InputError: a camera that neither sees a board in a known place nor one that another camera sees with it.
+        InputError: a camera sees neither a board of known pose nor a board pose that a connected camera sees too.
     """
-    if not _placed(views):
+    if not _share_world(views):
         raise InputError(
-            f"camera {list(views)[1]}: with several cameras expected a picture with a known place of the board, found "
-            "none; list one per camera under `world` in board.yaml, or say `simultaneous: true` where pictures of one "
-            "name were taken together"
+            f"camera {list(views)[1]}: with several cameras expected an image in which the pose of the board is known, "
+            "found none; list one per camera under `world` in board.yaml, or write `simultaneous: true` if images of "
+            "the same name were taken at the same time"
         )
 
 
-def _pictures(images: Path) -> dict[str, dict[str, Path]]:
-    """By camera, the pictures by `camera/file`; a folder without sub-folders is one camera."""
+def _image_paths(images: Path) -> dict[str, dict[str, Path]]:
+    """Image paths by camera and by `camera/file`. A folder without subfolders is one camera."""
     folders = sorted(path for path in images.iterdir() if path.is_dir())
     found = {
         folder.name: {
-            f"{folder.name}/{path.name}": path for path in sorted(folder.iterdir()) if path.suffix.lower() in PICTURES
+            f"{folder.name}/{path.name}": path
+            for path in sorted(folder.iterdir())
+            if path.suffix.lower() in IMAGE_SUFFIXES
         }
         for folder in folders or [images]
     }
-    found = {name: pictures for name, pictures in found.items() if pictures}
+    found = {name: paths for name, paths in found.items() if paths}
     if not found:
-        raise InputError(f"expected pictures of the board in {images}/<camera>/, found none; check the path")
+        raise InputError(f"expected images of the board in {images}/<camera>/, found none; check the path")
     return found
 
 
-def _known_pictures(description: BoardFile, pictures: dict[str, dict[str, Path]], images: Path) -> None:
-    present = {name for names in pictures.values() for name in names}
+def _check_named_images(description: BoardFile, paths: dict[str, dict[str, Path]], images: Path) -> None:
+    present = {name for own in paths.values() for name in own}
     named = [(name, "world") for name in description.world]
     named += [(name, "moved") for move in description.moved for name in (move.from_, move.to)]
     for name, key in named:
         if name not in present:
             raise InputError(
-                f"board.yaml names {name}, which is not among the pictures in {images}; correct it under `{key}`"
+                f"board.yaml names {name}, which is not among the images in {images}; correct it under `{key}`"
             )
 
 
-def _placed(views: dict[str, list[View]]) -> bool:
-    """Whether every camera is tied to the world, by itself or through boards seen with another."""
+def _share_world(views: dict[str, list[View]]) -> bool:
+    """Whether every camera sees a board of known pose, or is connected with one that does through shared boards."""
     if len(views) == 1:
         return True
-    tied = {name for name, own in views.items() if any(view.pose for view in own)}
-    boards = {name: {view.board for view in own} for name, own in views.items()}
-    known = {view.board for own in views.values() for view in own if view.pose}
-    tied |= {name for name in views if boards[name] & known}
+    connected = {name for name, own in views.items() if any(view.known_pose for view in own)}
+    pose_keys = {name: {view.pose_key for view in own} for name, own in views.items()}
+    known = {view.pose_key for own in views.values() for view in own if view.known_pose}
+    connected |= {name for name in views if pose_keys[name] & known}
     while True:
-        more = {name for name in views if name not in tied and any(boards[name] & boards[other] for other in tied)}
+        more = {
+            name
+            for name in views
+            if name not in connected and any(pose_keys[name] & pose_keys[other] for other in connected)
+        }
         if not more:
-            return tied == set(views)
-        tied |= more
+            return connected == set(views)
+        connected |= more
 
 
-def _views(camera: str, pictures: dict[str, Path], description: BoardFile) -> tuple[list[View], tuple[int, int]]:
+def _find_views(camera: str, paths: dict[str, Path], description: BoardFile) -> tuple[list[View], tuple[int, int]]:
     views: list[View] = []
     sizes: dict[tuple[int, int], str] = {}
     with progress() as bar:
-        for name, path in bar.track(pictures.items(), description=f"{camera}: finding the board"):
+        for name, path in bar.track(paths.items(), description=f"{camera}: finding the board"):
             view, size = find_board(path, name, description)
             sizes.setdefault(size, name)
             if view is not None:
                 views.append(view)
             elif name in description.world:
                 raise InputError(
-                    f"{path}: board.yaml places the board in it, but it is not to be found there; "
-                    "check the pattern in board.yaml, or take the picture again"
+                    f"{path}: board.yaml gives the pose of the board in this image, but no board was found there; "
+                    "check the pattern in board.yaml, or take the image again"
                 )
     if len(sizes) > 1:
         found = ", ".join(f"{name} {w} x {h}" for (w, h), name in sizes.items())
-        raise InputError(f"camera {camera}: expected pictures of one size, found {found}; sort them")
+        raise InputError(f"camera {camera}: expected images of one size, found {found}; remove the others")
     return views, next(iter(sizes))

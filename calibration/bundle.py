@@ -1,7 +1,7 @@
-"""Bundle adjustment of boards seen by cameras.
+"""Bundle adjustment of cameras and board poses.
 
-Every camera maps world points X by p = R X to u = centre + (K2 p_xy + offset) / (1 + nearness p_z), then
-distorts. With nearness 0 this is the orthographic camera; else a pinhole at the distance 1 / nearness.
+Every camera maps a world point X to p = R X and u = centre + (K2 p_xy + offset) / (1 + inverse_distance p_z). Radial
+distortion follows. An inverse distance of 0 gives the orthographic camera, otherwise a pinhole at 1 / inverse_distance.
 """
 
 from collections.abc import Callable
@@ -10,37 +10,39 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rafl.calibration.camera import centre_and_half_diagonal
 from scipy.spatial.transform import Rotation
+
+from rafl.calibration.camera import centre_and_half_diagonal
 
 Array = NDArray[Any]
 
-CAMERA = 11  # mx, my, skew [px/mm], rotation vector, offset from the picture's centre [px], k1, k2, nearness [1/m]
-NEARNESS = 10
-BOARD = 6  # rotation vector, position [m]
-STEPS = 80  # of descent, at most
-OUTLIER = 0.5  # px: residuals beyond it count linearly
+# mx, my, skew [px/mm], rotation vector, offset from the image centre [px], k1, k2, inverse distance [1/m]
+CAMERA_PARAMETERS = 11
+INVERSE_DISTANCE = 10  # index of that camera parameter
+POSE_PARAMETERS = 6  # rotation vector, position [m]
+MAX_ITERATIONS = 80
+HUBER_THRESHOLD_PX = 0.5  # the cost of a larger residual grows linearly
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Observations, O in all, of boards that stand fixed, free, or moved along a line from another.
+class Observations:
+    """Observed board points, O in all. The pose of a board is known, free, or moved along a line from another pose.
 
     Attributes:
-        points: on the board [m], (O, 2).
+        points: board frame [m], (O, 2).
         pixels: (O, 2).
-        camera: of each observation, (O).
-        board: that it belongs to, or that its board was moved from, (O).
-        move: index of the distance its board was moved by, -1 for none, (O).
-        directions: of the moves, world frame, (D, 3).
-        known: boards whose pose is not to be changed, (B).
-        sizes: of the pictures, (C, 2).
+        camera: index of the camera, (O).
+        pose: index of the board pose, or of the pose that the board was moved from, (O).
+        move: index of the move, -1 for none, (O).
+        directions: directions of the moves, world frame, (D, 3).
+        known: whether a pose is known and stays fixed, (B).
+        sizes: image sizes [px], (C, 2).
     """
 
     points: Array
     pixels: Array
     camera: NDArray[np.int64]
-    board: NDArray[np.int64]
+    pose: NDArray[np.int64]
     move: NDArray[np.int64]
     directions: Array
     known: NDArray[np.bool_]
@@ -49,21 +51,21 @@ class Scene:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Cameras (C, 11), boards (B, 6) and distances of moves (D) [m]."""
+    """Camera parameters (C, 11), board poses (B, 6) and distances of the moves (D) [m]."""
 
     cameras: Array
-    boards: Array
+    poses: Array
     distances: Array
 
 
 @dataclass(frozen=True)
-class Adjusted:
-    """What a bundle adjustment found.
+class Adjustment:
+    """Result of a bundle adjustment.
 
     Attributes:
         unknowns: the solution.
-        residual: of every observation [px], (O, 2).
-        covariance: of each camera's eleven parameters, (C, 11, 11).
+        residual: residual of every observation [px], (O, 2).
+        covariance: covariance of each camera's parameters, (C, 11, 11).
     """
 
     unknowns: Unknowns
@@ -71,149 +73,163 @@ class Adjusted:
     covariance: Array
 
     @property
-    def size(self) -> float:
-        """Root mean square residual of a coordinate, outliers counted linearly [px]."""
-        away = np.linalg.norm(self.residual, axis=1)
-        square = np.where(away < OUTLIER, away**2, 2.0 * OUTLIER * away - OUTLIER**2)
+    def robust_rms(self) -> float:
+        """Root mean square residual of a coordinate [px]; outliers count linearly (Huber)."""
+        distance = np.linalg.norm(self.residual, axis=1)
+        linear = 2.0 * HUBER_THRESHOLD_PX * distance - HUBER_THRESHOLD_PX**2
+        square = np.where(distance < HUBER_THRESHOLD_PX, distance**2, linear)
         return float(np.sqrt(square.mean() / 2.0))
 
 
-def project(scene: Scene, unknowns: Unknowns) -> Array:
-    """Pixels of all observations, (O, 2)."""
-    turn = Rotation.from_rotvec(unknowns.boards[:, :3]).as_matrix()
-    world = np.einsum("oij,oj->oi", turn[scene.board][:, :, :2], scene.points) + unknowns.boards[scene.board, 3:]
+def project_observations(observations: Observations, unknowns: Unknowns) -> Array:
+    """Predicted pixels of all observations, (O, 2)."""
+    rotations = Rotation.from_rotvec(unknowns.poses[:, :3]).as_matrix()
+    world = (
+        np.einsum("oij,oj->oi", rotations[observations.pose][:, :, :2], observations.points)
+        + unknowns.poses[observations.pose, 3:]
+    )
     if len(unknowns.distances):
-        moved = unknowns.distances[scene.move, None] * scene.directions[scene.move]
-        world = world + np.where(scene.move[:, None] >= 0, moved, 0.0)
+        moved = unknowns.distances[observations.move, None] * observations.directions[observations.move]
+        world = world + np.where(observations.move[:, None] >= 0, moved, 0.0)
     cameras = unknowns.cameras
-    rotation = Rotation.from_rotvec(cameras[:, 3:6]).as_matrix()[scene.camera]
-    own = cameras[scene.camera]
-    seen = np.einsum("oij,oj->oi", rotation, world)
-    u = 1e3 * (own[:, 0] * seen[:, 0] + own[:, 2] * seen[:, 1]) + own[:, 6]
-    v = 1e3 * own[:, 1] * seen[:, 1] + own[:, 7]
-    off = np.stack([u, v], axis=1) / (1.0 + own[:, NEARNESS] * seen[:, 2])[:, None]
-    sizes = [centre_and_half_diagonal(tuple(size)) for size in scene.sizes]
-    centre = np.array([c for c, _ in sizes])[scene.camera]
-    half = np.array([h for _, h in sizes])[scene.camera]
-    square = (off**2).sum(1) / half**2
-    return centre + off * (1.0 + own[:, 8] * square + own[:, 9] * square**2)[:, None]
+    rotation = Rotation.from_rotvec(cameras[:, 3:6]).as_matrix()[observations.camera]
+    own = cameras[observations.camera]
+    local = np.einsum("oij,oj->oi", rotation, world)
+    u = 1e3 * (own[:, 0] * local[:, 0] + own[:, 2] * local[:, 1]) + own[:, 6]
+    v = 1e3 * own[:, 1] * local[:, 1] + own[:, 7]
+    offset = np.stack([u, v], axis=1) / (1.0 + own[:, INVERSE_DISTANCE] * local[:, 2])[:, None]
+    sizes = [centre_and_half_diagonal(tuple(size)) for size in observations.sizes]
+    centre = np.array([c for c, _ in sizes])[observations.camera]
+    half_diagonal = np.array([h for _, h in sizes])[observations.camera]
+    r2 = (offset**2).sum(1) / half_diagonal**2
+    pixels: Array = centre + offset * (1.0 + own[:, 8] * r2 + own[:, 9] * r2**2)[:, None]
+    return pixels
 
 
-def adjust(scene: Scene, start: Unknowns, *, perspective: bool = False, cameras_known: bool = False) -> Adjusted:
-    """Least squares over all cameras and free boards, robust against single wrong corners.
+def adjust_bundle(
+    observations: Observations, start: Unknowns, *, perspective: bool = False, fixed_cameras: bool = False
+) -> Adjustment:
+    """Robust least squares over all cameras, free board poses and move distances.
 
     Args:
-        scene: the observations.
-        start: near enough to the solution.
-        perspective: whether nearness is solved for; else it stays as it is.
-        cameras_known: whether only the boards move.
+        observations: the observed points.
+        start: initial guess near the solution.
+        perspective: whether to solve for the inverse distances of the cameras; otherwise they keep their values.
+        fixed_cameras: whether to keep the cameras and solve for the poses only.
     """
-    own = np.ones(CAMERA, dtype=bool)
-    own[NEARNESS] = perspective
-    own[2] = not perspective  # a pinhole's pixels are square to its axes
-    if cameras_known:
+    own = np.ones(CAMERA_PARAMETERS, dtype=bool)
+    own[INVERSE_DISTANCE] = perspective
+    own[2] = not perspective  # the pinhole model has no skew
+    if fixed_cameras:
         own[:] = False
-    free = ~scene.known
-    shape = (len(start.cameras), len(start.boards))
-    counts = (shape[0] * own.sum(), free.sum() * BOARD, len(start.distances))
-    camera_slots = np.full((shape[0], CAMERA), -1)
+    free = ~observations.known
+    shape = (len(start.cameras), len(start.poses))
+    counts = (shape[0] * own.sum(), free.sum() * POSE_PARAMETERS, len(start.distances))
+    # Index of each parameter in the vector x; -1 for a fixed parameter.
+    camera_slots = np.full((shape[0], CAMERA_PARAMETERS), -1)
     camera_slots[:, own] = np.arange(counts[0]).reshape(shape[0], -1)
-    board_slots = np.full((shape[1], BOARD), -1)
-    board_slots[free] = counts[0] + np.arange(counts[1]).reshape(-1, BOARD)
+    pose_slots = np.full((shape[1], POSE_PARAMETERS), -1)
+    pose_slots[free] = counts[0] + np.arange(counts[1]).reshape(-1, POSE_PARAMETERS)
 
     def unpack(x: Array) -> Unknowns:
-        cameras, boards = start.cameras.copy(), start.boards.copy()
+        cameras, poses = start.cameras.copy(), start.poses.copy()
         cameras[:, own] = x[: counts[0]].reshape(shape[0], -1)
-        boards[free] = x[counts[0] : counts[0] + counts[1]].reshape(-1, BOARD)
-        return Unknowns(cameras, boards, x[counts[0] + counts[1] :])
+        poses[free] = x[counts[0] : counts[0] + counts[1]].reshape(-1, POSE_PARAMETERS)
+        return Unknowns(cameras, poses, x[counts[0] + counts[1] :])
 
-    def gaps(x: Array) -> Array:
-        return (project(scene, unpack(x)) - scene.pixels).ravel()
+    def residuals(x: Array) -> Array:
+        return (project_observations(observations, unpack(x)) - observations.pixels).ravel()
 
-    def slopes(x: Array) -> Array:
-        # An observation knows one camera and one board: a parameter of all of them is varied at once.
+    def jacobian_at(x: Array) -> Array:
+        # An observation depends on one camera and one pose: a parameter of all cameras is varied at once.
         here = unpack(x)
-        jacobian = np.zeros((2 * len(scene.points), len(x)))
-        rows = np.arange(len(scene.points))
+        jacobian = np.zeros((2 * len(observations.points), len(x)))
+        rows = np.arange(len(observations.points))
         for number in np.flatnonzero(own).tolist():
-            step = _step(here.cameras[:, number], 1e-3 if number == NEARNESS else 1e-2)
+            step = _difference_step(here.cameras[:, number], 1e-3 if number == INVERSE_DISTANCE else 1e-2)
             varied = [here.cameras.copy(), here.cameras.copy()]
             for sign, cameras in zip((1, -1), varied, strict=True):
                 cameras[:, number] += sign * step
-            up, down = (project(scene, replace(here, cameras=cameras)) for cameras in varied)
-            _fill(jacobian, rows, camera_slots[scene.camera, number], (up - down) / (2 * step))
-        for number in range(BOARD):
+            up, down = (project_observations(observations, replace(here, cameras=cameras)) for cameras in varied)
+            _fill_columns(jacobian, rows, camera_slots[observations.camera, number], (up - down) / (2 * step))
+        for number in range(POSE_PARAMETERS):
             step = 1e-6
-            varied = [here.boards.copy(), here.boards.copy()]
-            for sign, boards in zip((1, -1), varied, strict=True):
-                boards[:, number] += sign * step
-            up, down = (project(scene, replace(here, boards=boards)) for boards in varied)
-            _fill(jacobian, rows, board_slots[scene.board, number], (up - down) / (2 * step))
+            varied = [here.poses.copy(), here.poses.copy()]
+            for sign, poses in zip((1, -1), varied, strict=True):
+                poses[:, number] += sign * step
+            up, down = (project_observations(observations, replace(here, poses=poses)) for poses in varied)
+            _fill_columns(jacobian, rows, pose_slots[observations.pose, number], (up - down) / (2 * step))
         if len(here.distances):
             step = 1e-6
-            up, down = (project(scene, replace(here, distances=here.distances + sign * step)) for sign in (1, -1))
-            slots = np.where(scene.move >= 0, counts[0] + counts[1] + scene.move, -1)
-            _fill(jacobian, rows, slots, (up - down) / (2 * step))
+            up, down = (
+                project_observations(observations, replace(here, distances=here.distances + sign * step))
+                for sign in (1, -1)
+            )
+            slots = np.where(observations.move >= 0, counts[0] + counts[1] + observations.move, -1)
+            _fill_columns(jacobian, rows, slots, (up - down) / (2 * step))
         return jacobian
 
-    x0 = np.concatenate([start.cameras[:, own].ravel(), start.boards[free].ravel(), start.distances])
-    x = _descend(gaps, slopes, x0)
-    residual = gaps(x).reshape(-1, 2)
-    jacobian = slopes(x)
-    inliers = np.repeat(np.linalg.norm(residual, axis=1) < 4.0 * OUTLIER, 2)
-    # Depths that no camera sees are the null space.
+    x0 = np.concatenate([start.cameras[:, own].ravel(), start.poses[free].ravel(), start.distances])
+    x = _levenberg_marquardt(residuals, jacobian_at, x0)
+    residual = residuals(x).reshape(-1, 2)
+    jacobian = jacobian_at(x)
+    inliers = np.repeat(np.linalg.norm(residual, axis=1) < 4.0 * HUBER_THRESHOLD_PX, 2)
+    # Depths that no camera observes form the null space.
     rank = np.linalg.matrix_rank(jacobian[inliers] / (np.linalg.norm(jacobian[inliers], axis=0) + 1e-12), tol=1e-7)
-    freedom = max(int(inliers.sum()) - int(rank), 1)
+    degrees_of_freedom = max(int(inliers.sum()) - int(rank), 1)
     scale = np.linalg.norm(jacobian[inliers], axis=0) + 1e-12
     scaled = jacobian[inliers] / scale
     inverse = np.linalg.pinv(scaled.T @ scaled, rcond=1e-12) / np.outer(scale, scale)
-    full = (residual.ravel()[inliers] ** 2).sum() / freedom * inverse
-    covariance = np.zeros((shape[0], CAMERA, CAMERA))
+    full = (residual.ravel()[inliers] ** 2).sum() / degrees_of_freedom * inverse
+    covariance = np.zeros((shape[0], CAMERA_PARAMETERS, CAMERA_PARAMETERS))
     for camera in range(shape[0]):
         slots = camera_slots[camera, own]
         covariance[camera][np.ix_(own, own)] = full[np.ix_(slots, slots)]
-    return Adjusted(unpack(x), residual, covariance)
+    return Adjustment(unpack(x), residual, covariance)
 
 
-def _descend(gaps: Callable[[Array], Array], slopes: Callable[[Array], Array], x: Array) -> Array:
-    """Levenberg and Marquardt's steps, points farther off than `OUTLIER` weighing less (Huber)."""
+def _levenberg_marquardt(residuals: Callable[[Array], Array], jacobian_at: Callable[[Array], Array], x: Array) -> Array:
+    """Minimise the Huber cost of the residuals by iteratively reweighted Levenberg-Marquardt steps."""
 
-    def weighed(gap: Array) -> tuple[Array, float]:
-        away = np.linalg.norm(gap.reshape(-1, 2), axis=1)
-        weight = np.minimum(1.0, OUTLIER / np.maximum(away, 1e-12))
-        cost = np.where(away < OUTLIER, away**2, 2.0 * OUTLIER * away - OUTLIER**2).sum()
+    def weights_and_cost(values: Array) -> tuple[Array, float]:
+        distance = np.linalg.norm(values.reshape(-1, 2), axis=1)
+        weight = np.minimum(1.0, HUBER_THRESHOLD_PX / np.maximum(distance, 1e-12))
+        linear = 2.0 * HUBER_THRESHOLD_PX * distance - HUBER_THRESHOLD_PX**2
+        cost = np.where(distance < HUBER_THRESHOLD_PX, distance**2, linear).sum()
         return np.repeat(weight, 2), float(cost)
 
-    gap = gaps(x)
-    weight, cost = weighed(gap)
+    residual = residuals(x)
+    weight, cost = weights_and_cost(residual)
     damping = 1e-3
-    for _ in range(STEPS):
-        jacobian = slopes(x)
+    for _ in range(MAX_ITERATIONS):
+        jacobian = jacobian_at(x)
         scale = np.sqrt((weight[:, None] * jacobian**2).sum(0)) + 1e-9
         scaled = jacobian / scale
         normal = scaled.T @ (weight[:, None] * scaled)
-        right = -scaled.T @ (weight * gap)
-        gained = 0.0
+        right = -scaled.T @ (weight * residual)
+        decrease = 0.0
         for _ in range(12):
             step = np.linalg.solve(normal + (damping + 1e-10) * np.eye(len(x)), right) / scale
-            tried = gaps(x + step)
-            new_weight, new_cost = weighed(tried)
+            trial = residuals(x + step)
+            new_weight, new_cost = weights_and_cost(trial)
             if new_cost <= cost:
-                gained = cost - new_cost
-                x, gap, weight, cost = x + step, tried, new_weight, new_cost
+                decrease = cost - new_cost
+                x, residual, weight, cost = x + step, trial, new_weight, new_cost
                 damping = max(0.1 * damping, 1e-10)
                 break
             damping *= 10.0
-        if gained <= 1e-8 * cost:
+        if decrease <= 1e-8 * cost:
             break
     return x
 
 
-def _step(values: Array, least: float) -> float:
-    return 1e-6 * max(float(np.abs(values).max()), least)
+def _difference_step(values: Array, minimum: float) -> float:
+    """Step of a central difference in a parameter with these values."""
+    return 1e-6 * max(float(np.abs(values).max()), minimum)
 
 
-def _fill(jacobian: Array, rows: NDArray[np.int64], slots: NDArray[np.int64], slope: Array) -> None:
+def _fill_columns(jacobian: Array, rows: NDArray[np.int64], slots: NDArray[np.int64], derivative: Array) -> None:
+    """Write the derivatives (O, 2) of the observations into the columns `slots`; -1 for none."""
     used = slots >= 0
-    jacobian[2 * rows[used], slots[used]] = slope[used, 0]
-    jacobian[2 * rows[used] + 1, slots[used]] = slope[used, 1]
+    jacobian[2 * rows[used], slots[used]] = derivative[used, 0]
+    jacobian[2 * rows[used] + 1, slots[used]] = derivative[used, 1]

@@ -1,4 +1,4 @@
-"""Camera models: from the world frame to pixels and back."""
+"""Camera models: projection of world points to pixels, and its inverse distortion."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -13,12 +13,12 @@ Array = NDArray[Any]
 
 @dataclass(frozen=True)
 class Plane:
-    """Where a marker lies that one camera alone sees: normal . X = offset.
+    """Plane of the markers that only one camera sees: normal . X = offset.
 
     Attributes:
         normal: unit vector, world frame, (3).
         offset: [m].
-        sigma: how far markers may stray from it, one standard deviation [m].
+        sigma: standard deviation of the markers' distances from the plane [m].
     """
 
     normal: tuple[float, float, float]
@@ -28,15 +28,15 @@ class Plane:
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """What both models share: world to camera, then an ideal image, then distortion.
+    """Base of the camera models: world to camera, projection to undistorted pixels, then distortion.
 
     Attributes:
         image_size: width and height [px].
-        rotation_vector: world to camera (x right, y down, z away from the camera) [rad], (3).
-        plane: for markers this camera alone sees.
+        rotation_vector: rotation from world to camera (x right, y down, z away from the camera) [rad], (3).
+        plane: plane of the markers that only this camera sees.
         time_offset: this camera's clock minus the rig's [s].
-        residual: root mean square of the calibration [px].
-        covariance: of the model's ten first parameters, see `datasets/README.md`, (10, 10), or None.
+        residual: RMS reprojection residual of the calibration [px].
+        covariance: covariance of the first ten model parameters, see `datasets/README.md`, (10, 10), or None.
     """
 
     image_size: tuple[int, int]
@@ -48,39 +48,41 @@ class Camera:
 
     @cached_property
     def rotation(self) -> Array:
-        """World to camera, (3, 3)."""
-        return Rotation.from_rotvec(self.rotation_vector).as_matrix()
+        """Rotation from world to camera, (3, 3)."""
+        result: Array = Rotation.from_rotvec(self.rotation_vector).as_matrix()
+        return result
 
     @property
     def viewing_direction(self) -> Array:
-        """Unit vector of the line of sight at the picture's centre, away from the camera, world frame, (3)."""
-        return self.rotation[2]
+        """Line of sight at the image centre: unit vector away from the camera, world frame, (3)."""
+        direction: Array = self.rotation[2]
+        return direction
 
-    def ideal(self, points: Array) -> Array:
+    def project_undistorted(self, points: Array) -> Array:
         """Undistorted pixels (..., 2) of world points (..., 3) [m]."""
         raise NotImplementedError
 
-    def slopes(self, points: Array) -> Array:
-        """Derivatives of `ideal` by the point [px/m], (..., 2, 3)."""
+    def projection_jacobian(self, points: Array) -> Array:
+        """Derivative of `project_undistorted` with respect to the point [px/m], (..., 2, 3)."""
         raise NotImplementedError
 
-    def distort(self, ideal: Array) -> Array:
-        """Pixels (..., 2) where undistorted pixels (..., 2) really appear."""
+    def distort(self, undistorted: Array) -> Array:
+        """Distorted pixels (..., 2) of undistorted pixels (..., 2)."""
         raise NotImplementedError
 
     def undistort(self, pixels: Array) -> Array:
-        """The inverse of `distort`, by fixed-point iteration, (..., 2)."""
-        ideal = pixels.copy()
+        """Undistorted pixels (..., 2): the inverse of `distort`, by fixed-point iteration."""
+        undistorted = pixels.copy()
         for _ in range(40):
-            away = pixels - self.distort(ideal)
-            ideal += away
-            if not np.nanmax(np.abs(away), initial=0.0) > 1e-10:
+            error = pixels - self.distort(undistorted)
+            undistorted += error
+            if not np.nanmax(np.abs(error), initial=0.0) > 1e-10:
                 break
-        return ideal
+        return undistorted
 
     def project(self, points: Array) -> Array:
         """Pixels (..., 2) of world points (..., 3) [m]."""
-        return self.distort(self.ideal(points))
+        return self.distort(self.project_undistorted(points))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,8 +92,8 @@ class OrthographicCamera(Camera):
     Attributes:
         scale: mx, my [px/m].
         skew: [px/m].
-        offset: image of the world origin [px], (2).
-        distortion: k1, k2 about the image centre, in units of half the image diagonal.
+        offset: undistorted pixel of the world origin [px], (2).
+        distortion: k1, k2 about the image centre, for radii in units of half the image diagonal.
     """
 
     scale: tuple[float, float]
@@ -100,33 +102,35 @@ class OrthographicCamera(Camera):
     distortion: tuple[float, float] = (0.0, 0.0)
 
     @cached_property
-    def matrix(self) -> Array:
+    def projection_matrix(self) -> Array:
         """K2 R[:2]: undistorted pixels per metre of world displacement, (2, 3)."""
         k2 = np.array([[self.scale[0], self.skew], [0.0, self.scale[1]]])
-        return k2 @ self.rotation[:2]
+        result: Array = k2 @ self.rotation[:2]
+        return result
 
-    def ideal(self, points: Array) -> Array:
+    def project_undistorted(self, points: Array) -> Array:
         """See `Camera`."""
-        return points @ self.matrix.T + np.asarray(self.offset)
+        result: Array = points @ self.projection_matrix.T + np.asarray(self.offset)
+        return result
 
-    def slopes(self, points: Array) -> Array:
-        """See `Camera`; the same everywhere."""
-        return np.broadcast_to(self.matrix, (*points.shape[:-1], 2, 3))
+    def projection_jacobian(self, points: Array) -> Array:
+        """See `Camera`. It is the same for all points."""
+        return np.broadcast_to(self.projection_matrix, (*points.shape[:-1], 2, 3))
 
-    def distort(self, ideal: Array) -> Array:
+    def distort(self, undistorted: Array) -> Array:
         """See `Camera`."""
-        centre, half = centre_and_half_diagonal(self.image_size)
-        return distort(ideal, self.distortion, centre, half)
+        centre, half_diagonal = centre_and_half_diagonal(self.image_size)
+        return distort(undistorted, self.distortion, centre, half_diagonal)
 
 
 @dataclass(frozen=True, kw_only=True)
 class PinholeCamera(Camera):
-    """OpenCV's model: u = f x / z + c after distortion of (x, y) / z.
+    """OpenCV's pinhole model: u = f x / z + c, with distorted (x, y) / z.
 
     Attributes:
-        focal: fx, fy [px].
-        centre: cx, cy [px].
-        translation: of the world origin in the camera [m], (3).
+        focal: focal lengths fx, fy [px].
+        centre: principal point cx, cy [px].
+        translation: position of the world origin in the camera frame [m], (3).
         distortion: k1, k2, p1, p2, k3.
     """
 
@@ -135,30 +139,34 @@ class PinholeCamera(Camera):
     translation: tuple[float, float, float]
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
-    def _in_camera(self, points: Array) -> Array:
-        return points @ self.rotation.T + np.asarray(self.translation)
+    def _to_camera_frame(self, points: Array) -> Array:
+        result: Array = points @ self.rotation.T + np.asarray(self.translation)
+        return result
 
-    def ideal(self, points: Array) -> Array:
+    def project_undistorted(self, points: Array) -> Array:
         """See `Camera`."""
-        seen = self._in_camera(points)
-        return seen[..., :2] / seen[..., 2:] * np.asarray(self.focal) + np.asarray(self.centre)
+        local = self._to_camera_frame(points)
+        result: Array = local[..., :2] / local[..., 2:] * np.asarray(self.focal) + np.asarray(self.centre)
+        return result
 
-    def slopes(self, points: Array) -> Array:
+    def projection_jacobian(self, points: Array) -> Array:
         """See `Camera`."""
-        seen = self._in_camera(points)
-        depth = seen[..., 2, None, None]
+        local = self._to_camera_frame(points)
+        depth = local[..., 2, None, None]
         focal = np.asarray(self.focal)[:, None]
-        return focal / depth * (self.rotation[:2] - seen[..., :2, None] / depth * self.rotation[2])
+        result: Array = focal / depth * (self.rotation[:2] - local[..., :2, None] / depth * self.rotation[2])
+        return result
 
-    def distort(self, ideal: Array) -> Array:
+    def distort(self, undistorted: Array) -> Array:
         """See `Camera`."""
-        x, y = np.moveaxis((ideal - np.asarray(self.centre)) / np.asarray(self.focal), -1, 0)
+        x, y = np.moveaxis((undistorted - np.asarray(self.centre)) / np.asarray(self.focal), -1, 0)
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        bent_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-        bent_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        return np.stack([bent_x, bent_y], axis=-1) * np.asarray(self.focal) + np.asarray(self.centre)
+        distorted_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
+        distorted_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
+        result: Array = np.stack([distorted_x, distorted_y], axis=-1) * np.asarray(self.focal) + np.asarray(self.centre)
+        return result
 
 
 def centre_and_half_diagonal(image_size: tuple[int, int]) -> tuple[Array, float]:
@@ -167,8 +175,9 @@ def centre_and_half_diagonal(image_size: tuple[int, int]) -> tuple[Array, float]
     return (size - 1.0) / 2.0, float(np.linalg.norm(size) / 2.0)
 
 
-def distort(ideal: Array, distortion: tuple[float, float], centre: Array, half: float) -> Array:
-    """centre + (u - centre) (1 + k1 r^2 + k2 r^4), r in units of `half`; pixels (..., 2)."""
-    off = ideal - centre
-    square = (off**2).sum(-1, keepdims=True) / half**2
-    return centre + off * (1.0 + distortion[0] * square + distortion[1] * square**2)
+def distort(undistorted: Array, distortion: tuple[float, float], centre: Array, half_diagonal: float) -> Array:
+    """centre + (u - centre) (1 + k1 r^2 + k2 r^4) for pixels u (..., 2), with r in units of `half_diagonal`."""
+    offset = undistorted - centre
+    r2 = (offset**2).sum(-1, keepdims=True) / half_diagonal**2
+    result: Array = centre + offset * (1.0 + distortion[0] * r2 + distortion[1] * r2**2)
+    return result

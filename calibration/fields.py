@@ -1,4 +1,4 @@
-"""Kinds of values in the files people write."""
+"""Validated field types of the YAML files that users write."""
 
 from typing import Annotated
 
@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import AfterValidator
 
 
-def _unit(value: tuple[float, float, float]) -> tuple[float, float, float]:
+def _unit_vector(value: tuple[float, float, float]) -> tuple[float, float, float]:
     length = float(np.linalg.norm(value))
     if not abs(length - 1.0) < 1e-3:
         raise ValueError("expected a direction of length 1")
@@ -14,11 +14,11 @@ def _unit(value: tuple[float, float, float]) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _positive(value: tuple[float, float]) -> tuple[float, float]:
+def _check_positive(value: tuple[float, float]) -> tuple[float, float]:
     if not min(value) > 0:
         raise ValueError("expected two positive numbers")
     return value
 
 
-Direction = Annotated[tuple[float, float, float], AfterValidator(_unit)]  # made exactly one long
-PositivePair = Annotated[tuple[float, float], AfterValidator(_positive)]
+Direction = Annotated[tuple[float, float, float], AfterValidator(_unit_vector)]  # normalised to length 1
+PositivePair = Annotated[tuple[float, float], AfterValidator(_check_positive)]

@@ -1,4 +1,4 @@
-"""Where a bundle adjustment may begin: each of the mirrored rigs that the views allow."""
+"""Initial guesses for the bundle adjustment: one for each mirrored rig that the views allow."""
 
 import itertools
 from dataclasses import dataclass
@@ -6,123 +6,123 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rafl.calibration.board import BoardFile, View, WorldPose
-from rafl.calibration.bundle import CAMERA, Scene, Unknowns
-from rafl.calibration.camera import centre_and_half_diagonal
-from rafl.calibration.views import Affine, affine_of
 from scipy.spatial.transform import Rotation
 
+from rafl.calibration.board import BoardFile, View, WorldPose
+from rafl.calibration.bundle import CAMERA_PARAMETERS, Observations, Unknowns
+from rafl.calibration.camera import centre_and_half_diagonal
+from rafl.calibration.views import AffineView, fit_affine
 from rafl.common.errors import InputError
 
 Array = NDArray[Any]
 
 
 @dataclass(frozen=True)
-class Problem:
-    """Cameras that see boards in common, with everything a start needs.
+class CameraGroup:
+    """Cameras connected by shared board poses, with the data for an initial guess.
 
     Attributes:
-        names: of the cameras.
+        names: names of the cameras.
         views: by camera.
-        affines: of the views.
-        scales: of the cameras [px/m].
-        sizes: of their pictures [px].
-        boards: keys of those that stand by themselves.
-        poses: of boards in known places.
-        moves: of each moved board, from which and along which direction.
+        affines: affine maps of the views, by camera.
+        scales: scales of the cameras [px/m].
+        sizes: image sizes [px].
+        pose_keys: keys of the board poses that are not defined by a move.
+        known_poses: by key.
+        moves: by key of a moved board's pose, the key of the pose it was moved from and the direction.
     """
 
     names: list[str]
     views: list[list[View]]
-    affines: list[list[Affine]]
+    affines: list[list[AffineView]]
     scales: list[float]
     sizes: list[tuple[int, int]]
-    boards: list[str]
-    poses: dict[str, WorldPose]
+    pose_keys: list[str]
+    known_poses: dict[str, WorldPose]
     moves: dict[str, tuple[str, Array]]
 
     @classmethod
     def of(
         cls, names: list[str], views: dict[str, list[View]], sizes: dict[str, tuple[int, int]], description: BoardFile
-    ) -> "Problem":
-        """That of some cameras of a rig; without any known place the first board that was not moved is the world."""
+    ) -> "CameraGroup":
+        """Group some cameras of a rig. If no pose is known, the first board that was not moved is the world frame."""
         own = [views[name] for name in names]
-        seen = {view.name: view.board for group in own for view in group}
+        key_of = {view.name: view.pose_key for group in own for view in group}
         moves = {
-            seen[move.to]: (seen[move.from_], np.asarray(move.along))
+            key_of[move.to]: (key_of[move.from_], np.asarray(move.along))
             for move in description.moved
-            if move.to in seen and move.from_ in seen
+            if move.to in key_of and move.from_ in key_of
         }
-        boards = list(dict.fromkeys(view.board for group in own for view in group if view.board not in moves))
-        poses = {view.board: view.pose for group in own for view in group if view.pose is not None}
-        if not poses.keys() & set(boards):
-            poses[boards[0]] = WorldPose(origin_mm=(0, 0, 0), x_axis=(1, 0, 0), y_axis=(0, 1, 0))
-        scales = [max(float(np.linalg.norm(affine_of(view).matrix, 2)) for view in group) for group in own]
-        affines = [[affine_of(view, scale) for view in group] for group, scale in zip(own, scales, strict=True)]
-        return cls(names, own, affines, scales, [sizes[name] for name in names], boards, poses, moves)
+        keys = list(dict.fromkeys(view.pose_key for group in own for view in group if view.pose_key not in moves))
+        poses = {view.pose_key: view.known_pose for group in own for view in group if view.known_pose is not None}
+        if not poses.keys() & set(keys):
+            poses[keys[0]] = WorldPose(origin_mm=(0, 0, 0), x_axis=(1, 0, 0), y_axis=(0, 1, 0))
+        scales = [max(float(np.linalg.norm(fit_affine(view).matrix, 2)) for view in group) for group in own]
+        affines = [[fit_affine(view, scale) for view in group] for group, scale in zip(own, scales, strict=True)]
+        return cls(names, own, affines, scales, [sizes[name] for name in names], keys, poses, moves)
 
-    def owner(self, view: View) -> str:
-        """The board a view's board was moved from, or itself."""
-        return self.moves[view.board][0] if view.board in self.moves else view.board
+    def base_key(self, view: View) -> str:
+        """Key of the pose that the view's board was moved from, or of its own pose if it was not moved."""
+        return self.moves[view.pose_key][0] if view.pose_key in self.moves else view.pose_key
 
-    def reference(self, camera: int) -> View:
-        """The view by whose board a camera's tilt and plane are told: the first in a known place."""
-        return next((view for view in self.views[camera] if view.board in self.poses), self.views[camera][0])
+    def reference_view(self, camera: int) -> View:
+        """The view that defines a camera's tilt and plane: the first of known pose, or else the first."""
+        return next((view for view in self.views[camera] if view.pose_key in self.known_poses), self.views[camera][0])
 
 
-def scene_of(problem: Problem) -> Scene:
-    """All observations, as the bundle adjustment wants them."""
-    moved = list(problem.moves)
+def collect_observations(group: CameraGroup) -> Observations:
+    """All observations of a group, in the order of its cameras and views."""
+    moved = list(group.moves)
     parts = [
         (
             view,
             camera,
-            problem.boards.index(problem.owner(view)),
-            moved.index(view.board) if view.board in moved else -1,
+            group.pose_keys.index(group.base_key(view)),
+            moved.index(view.pose_key) if view.pose_key in moved else -1,
         )
-        for camera, group in enumerate(problem.views)
-        for view in group
+        for camera, views in enumerate(group.views)
+        for view in views
     ]
     counts = [len(view.points) for view, *_ in parts]
-    return Scene(
+    return Observations(
         np.concatenate([view.points for view, *_ in parts]),
         np.concatenate([view.pixels for view, *_ in parts]),
         np.repeat([camera for _, camera, _, _ in parts], counts),
-        np.repeat([board for _, _, board, _ in parts], counts),
+        np.repeat([pose for _, _, pose, _ in parts], counts),
         np.repeat([move for *_, move in parts], counts),
-        np.array([direction for _, direction in problem.moves.values()]).reshape(-1, 3),
-        np.array([board in problem.poses for board in problem.boards]),
-        np.array(problem.sizes),
+        np.array([direction for _, direction in group.moves.values()]).reshape(-1, 3),
+        np.array([key in group.known_poses for key in group.pose_keys]),
+        np.array(group.sizes),
     )
 
 
-def rotation_starts(problem: Problem) -> list[list[Array]]:
-    """Every combination of the cameras' world-to-camera rotations that the views allow."""
+def initial_rotations(group: CameraGroup) -> list[list[Array]]:
+    """Every combination of the cameras' world-to-camera rotations (3, 3) that the views allow."""
     per_camera: list[list[Array] | None] = []
-    for views, affines in zip(problem.views, problem.affines, strict=True):
-        posed = [k for k, view in enumerate(views) if view.board in problem.poses]
-        if not posed:
+    for views, affines in zip(group.views, group.affines, strict=True):
+        known = [k for k, view in enumerate(views) if view.pose_key in group.known_poses]
+        if not known:
             per_camera.append(None)
             continue
-        unique = _from_planes([views[k] for k in posed], problem)
-        first = problem.poses[views[posed[0]].board].rotation
-        per_camera.append([unique] if unique is not None else [r @ first.T for r in affines[posed[0]].rotations])
-    starts: list[list[Array | None]] = [[]]
+        unique = _rotation_from_known_poses([views[k] for k in known], group)
+        first = group.known_poses[views[known[0]].pose_key].rotation
+        per_camera.append([unique] if unique is not None else [r @ first.T for r in affines[known[0]].rotations])
+    combinations: list[list[Array | None]] = [[]]
     for options in per_camera:
         choices: list[Array | None] = [None] if options is None else [*options]
-        starts = [[*start, option] for start in starts for option in choices]
+        combinations = [[*combination, option] for combination in combinations for option in choices]
     result: list[list[Array]] = []
-    for start in starts:
-        result += _completed(problem, start)
+    for combination in combinations:
+        result += _add_missing_rotations(group, combination)
     return result
 
 
-def _from_planes(views: list[View], problem: Problem) -> Array | None:
-    """The rotation from boards in known places that do not lie in one plane; None where they do."""
-    points = np.concatenate([_world(view, problem.poses[view.board]) for view in views])
+def _rotation_from_known_poses(views: list[View], group: CameraGroup) -> Array | None:
+    """Camera rotation from boards of known pose; None if all their points lie in one plane."""
+    points = np.concatenate([_world_points(view, group.known_poses[view.pose_key]) for view in views])
     pixels = np.concatenate([view.pixels for view in views])
-    spread = np.linalg.svd(points - points.mean(0), compute_uv=False)
-    if spread[2] < 0.02 * spread[0]:
+    extent = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    if extent[2] < 0.02 * extent[0]:
         return None
     solution = np.linalg.lstsq(np.column_stack([points, np.ones(len(points))]), pixels, rcond=None)[0]
     u, _, vt = np.linalg.svd(solution[:3].T, full_matrices=False)
@@ -130,41 +130,45 @@ def _from_planes(views: list[View], problem: Problem) -> Array | None:
     return np.vstack([rows, np.cross(rows[0], rows[1])])
 
 
-def _world(view: View, pose: WorldPose) -> Array:
-    return pose.origin + view.points @ pose.rotation[:, :2].T
+def _world_points(view: View, pose: WorldPose) -> Array:
+    result: Array = pose.origin + view.points @ pose.rotation[:, :2].T
+    return result
 
 
-def _completed(problem: Problem, start: list[Array | None]) -> list[list[Array]]:
-    """Adds the rotations of cameras that saw no board of known pose, from those they share boards with."""
-    missing = [k for k, rotation in enumerate(start) if rotation is None]
+def _add_missing_rotations(group: CameraGroup, rotations: list[Array | None]) -> list[list[Array]]:
+    """Complete the rotations of cameras that saw no board of known pose, from cameras that share poses with them."""
+    missing = [k for k, rotation in enumerate(rotations) if rotation is None]
     if not missing:
-        return [[r for r in start if r is not None]]
+        return [[r for r in rotations if r is not None]]
     for camera in missing:
-        votes: list[Array] = []
-        for other, rotation in enumerate(start):
+        candidates: list[Array] = []
+        for other, rotation in enumerate(rotations):
             if rotation is None:
                 continue
-            theirs = {
-                view.board: affine for view, affine in zip(problem.views[other], problem.affines[other], strict=True)
+            others = {
+                view.pose_key: affine for view, affine in zip(group.views[other], group.affines[other], strict=True)
             }
-            for view, mine in zip(problem.views[camera], problem.affines[camera], strict=True):
-                if view.board in theirs:
-                    pairs = itertools.product(mine.rotations, theirs[view.board].rotations)
-                    votes += [a @ b.T @ rotation for a, b in pairs]
-        if votes:
-            filled = []
-            for option in _clusters(votes):
-                filled += _completed(problem, [option if k == camera else r for k, r in enumerate(start)])
-            return filled
+            for view, own in zip(group.views[camera], group.affines[camera], strict=True):
+                if view.pose_key in others:
+                    pairs = itertools.product(own.rotations, others[view.pose_key].rotations)
+                    candidates += [a @ b.T @ rotation for a, b in pairs]
+        if candidates:
+            completed = []
+            for option in _main_clusters(candidates):
+                completed += _add_missing_rotations(
+                    group, [option if k == camera else r for k, r in enumerate(rotations)]
+                )
+            return completed
     raise InputError(
-        f"camera {problem.names[missing[0]]}: with several cameras expected a picture with a known place of the board, "
-        "or one taken together with another camera's, found none; list one under `world` in board.yaml"
+        f"camera {group.names[missing[0]]}: with several cameras expected an image in which the pose of the board is "
+        "known, or an image taken at the same time as another camera's, found none; list one under `world` in "
+        "board.yaml"
     )
 
 
-def _clusters(votes: list[Array]) -> list[Array]:
-    """The two rotations that most votes gather about."""
-    stack = np.array(votes)
+def _main_clusters(rotations: list[Array]) -> list[Array]:
+    """Mean rotations of the two largest clusters; the rotations of a cluster are within 6 degrees of its centre."""
+    stack = np.array(rotations)
     result = []
     for _ in range(2):
         angles = np.arccos(np.clip((np.einsum("aij,bij->ab", stack, stack) - 1.0) / 2.0, -1.0, 1.0))
@@ -177,48 +181,48 @@ def _clusters(votes: list[Array]) -> list[Array]:
     return result
 
 
-def start_from(problem: Problem, rotations: list[Array]) -> Unknowns:
-    """Cameras and boards from the cameras' rotations and the views' affine maps."""
-    cameras = np.zeros((len(problem.names), CAMERA))
+def initial_unknowns(group: CameraGroup, rotations: list[Array]) -> Unknowns:
+    """Cameras, board poses and move distances from the cameras' rotations and the affine maps of the views."""
+    cameras = np.zeros((len(group.names), CAMERA_PARAMETERS))
     for k, rotation in enumerate(rotations):
-        scale = problem.scales[k]
-        centre, _ = centre_and_half_diagonal(problem.sizes[k])
+        scale = group.scales[k]
+        centre, _ = centre_and_half_diagonal(group.sizes[k])
         offsets = [
-            affine.shift - scale * rotation[:2] @ problem.poses[view.board].origin
-            for view, affine in zip(problem.views[k], problem.affines[k], strict=True)
-            if view.board in problem.poses
+            affine.shift - scale * rotation[:2] @ group.known_poses[view.pose_key].origin
+            for view, affine in zip(group.views[k], group.affines[k], strict=True)
+            if view.pose_key in group.known_poses
         ]
         cameras[k, :2] = 1e-3 * scale
         cameras[k, 3:6] = Rotation.from_matrix(rotation).as_rotvec()
         cameras[k, 6:8] = (np.mean(offsets, axis=0) if offsets else centre) - centre
-    boards = np.array([_board_start(problem, key, rotations, cameras) for key in problem.boards])
-    return Unknowns(cameras, boards, np.full(len(problem.moves), 0.02))
+    poses = np.array([_initial_pose(group, key, rotations, cameras) for key in group.pose_keys])
+    return Unknowns(cameras, poses, np.full(len(group.moves), 0.02))
 
 
-def _board_start(problem: Problem, key: str, rotations: list[Array], cameras: Array) -> Array:
-    """Rotation vector and position of a board, as its views together have it."""
-    if key in problem.poses:
-        pose = problem.poses[key]
+def _initial_pose(group: CameraGroup, key: str, rotations: list[Array], cameras: Array) -> Array:
+    """Rotation vector and position of a board, (6), from all views of this pose."""
+    if key in group.known_poses:
+        pose = group.known_poses[key]
         return np.concatenate([Rotation.from_matrix(pose.rotation).as_rotvec(), pose.origin])
     seen = [
         (camera, affine)
-        for camera, (views, affines) in enumerate(zip(problem.views, problem.affines, strict=True))
+        for camera, (views, affines) in enumerate(zip(group.views, group.affines, strict=True))
         for view, affine in zip(views, affines, strict=True)
-        if view.board == key
+        if view.pose_key == key
     ]
     options = [rotations[camera].T @ rotation for camera, affine in seen for rotation in affine.rotations]
 
-    def misfit(turn: Array) -> float:
+    def misfit(board: Array) -> float:
         return sum(
-            float(np.linalg.norm(problem.scales[c] * rotations[c][:2] @ turn[:, :2] - a.matrix) / problem.scales[c])
+            float(np.linalg.norm(group.scales[c] * rotations[c][:2] @ board[:, :2] - a.matrix) / group.scales[c])
             for c, a in seen
         )
 
-    turn = options[0] if len({camera for camera, _ in seen}) == 1 else min(options, key=misfit)
+    board = options[0] if len({camera for camera, _ in seen}) == 1 else min(options, key=misfit)
     rows, right = [], []
     for camera, affine in seen:
-        centre, _ = centre_and_half_diagonal(problem.sizes[camera])
-        rows.append(problem.scales[camera] * rotations[camera][:2])
+        centre, _ = centre_and_half_diagonal(group.sizes[camera])
+        rows.append(group.scales[camera] * rotations[camera][:2])
         right.append(affine.shift - centre - cameras[camera, 6:8])
-    place = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
-    return np.concatenate([Rotation.from_matrix(turn).as_rotvec(), place])
+    position = np.linalg.lstsq(np.concatenate(rows), np.concatenate(right), rcond=None)[0]
+    return np.concatenate([Rotation.from_matrix(board).as_rotvec(), position])

@@ -7,14 +7,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import yaml
 from pydantic import Field, field_validator
+
 from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane
 from rafl.calibration.fields import Direction, PositivePair
-
 from rafl.common.files import write_text
 from rafl.common.yaml_files import StrictModel, read_yaml
 
 FORMAT = "rafl-calibration/1"
-PLANE_SIGMA_MM = 0.5
+PLANE_SIGMA_MM = 0.5  # standard deviation of the markers' distances from their plane, unless given
 
 
 @dataclass(frozen=True)
@@ -40,20 +40,20 @@ class _Entry(StrictModel):
 
     @field_validator("image_size")
     @classmethod
-    def _pixels(cls, value: tuple[int, int]) -> tuple[int, int]:
+    def _check_positive(cls, value: tuple[int, int]) -> tuple[int, int]:
         if min(value) <= 0:
             raise ValueError("expected two positive numbers")
         return value
 
     @field_validator("covariance")
     @classmethod
-    def _square(cls, value: list[list[float]] | None) -> list[list[float]] | None:
+    def _check_shape(cls, value: list[list[float]] | None) -> list[list[float]] | None:
         if value is not None and [len(row) for row in value] != [10] * 10:
             raise ValueError("expected 10 rows of 10 numbers")
         return value
 
-    def shared(self) -> dict[str, Any]:
-        """What both models have."""
+    def common_arguments(self) -> dict[str, Any]:
+        """Arguments of the attributes that both camera models have, in SI units."""
         plane = None
         if self.plane is not None:
             plane = Plane(self.plane.normal, 1e-3 * self.plane.offset_mm, 1e-3 * self.plane.sigma_mm)
@@ -75,14 +75,14 @@ class _OrthographicEntry(_Entry):
     distortion: tuple[float, float] = (0.0, 0.0)
 
     def camera(self) -> Camera:
-        """In metres."""
+        """The camera, in SI units."""
         mx, my = self.pixels_per_mm
         return OrthographicCamera(
             scale=(1e3 * mx, 1e3 * my),
             skew=1e3 * self.skew,
             offset=self.offset_px,
             distortion=self.distortion,
-            **self.shared(),
+            **self.common_arguments(),
         )
 
 
@@ -94,14 +94,14 @@ class _PinholeEntry(_Entry):
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
     def camera(self) -> Camera:
-        """In metres."""
+        """The camera, in SI units."""
         x, y, z = self.translation_mm
         return PinholeCamera(
             focal=self.focal_px,
             centre=self.centre_px,
             translation=(1e-3 * x, 1e-3 * y, 1e-3 * z),
             distortion=self.distortion,
-            **self.shared(),
+            **self.common_arguments(),
         )
 
 
@@ -113,28 +113,29 @@ class _RigFile(StrictModel):
     cameras: dict[str, _CameraEntry] = Field(min_length=1)
 
 
-def read_rig(path: Path) -> Rig:
+def read_rig(path: str | Path) -> Rig:
     """Read `calib.yaml`.
 
     Raises:
-        InputError: missing, damaged, or of a newer version.
+        InputError: the file is missing, damaged or of a newer version.
     """
+    path = Path(path)
     content = read_yaml(path, _RigFile, "a calibration (calib.yaml)", FORMAT)
     return Rig({name: entry.camera() for name, entry in content.cameras.items()})
 
 
 def rig_text(rig: Rig) -> str:
     """The content of `calib.yaml`."""
-    cameras = {name: _plain(_entry(camera)) for name, camera in rig.cameras.items()}
+    cameras = {name: _to_python(_entry(camera)) for name, camera in rig.cameras.items()}
     return yaml.safe_dump({"format": FORMAT, "cameras": cameras}, sort_keys=False, default_flow_style=None)
 
 
-def _plain(value: Any) -> Any:
-    """The same in Python's own numbers, which YAML knows."""
+def _to_python(value: Any) -> Any:
+    """Convert NumPy numbers to Python numbers, which YAML can write."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: _to_python(item) for key, item in value.items()}
     if isinstance(value, list):
-        return [_plain(item) for item in value]
+        return [_to_python(item) for item in value]
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -172,6 +173,7 @@ def _entry(camera: Camera) -> dict[str, object]:
     return entry
 
 
-def write_rig(path: Path, rig: Rig) -> None:
-    """Write `calib.yaml`, whole or not at all."""
+def write_rig(path: str | Path, rig: Rig) -> None:
+    """Write `calib.yaml`, completely or not at all."""
+    path = Path(path)
     write_text(path, rig_text(rig))

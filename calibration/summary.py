@@ -1,18 +1,19 @@
-"""What a calibration found, in tables and sentences."""
+"""Result tables and messages of a calibration."""
 
 import numpy as np
+from rich.table import Table
+
 from rafl.calibration.board import View
 from rafl.calibration.camera import OrthographicCamera, PinholeCamera
 from rafl.calibration.rig import Rig
-from rafl.calibration.solve import PERSPECTIVE, Solution
+from rafl.calibration.solve import MIN_PERSPECTIVE_SIGMAS, Solution
 from rafl.calibration.validation import CheckedView
-from rich.table import Table
 
-HARMLESS_BIAS = 20e-6  # m: what a lens's perspective may cost before it is worth a warning
+MAX_SILENT_BIAS_M = 20e-6  # a larger marker error from a lens's perspective gives a warning
 
 
 def camera_table(solution: Solution, views: dict[str, list[View]]) -> Table:
-    """The cameras that board views gave."""
+    """The calibrated cameras: scale and its sigma, residual, and range of board tilts."""
     table = Table("camera", "model", "views", "residual [px]", "px/mm along u, v", "+-", "tilts [deg]")
     for name, camera in solution.rig.cameras.items():
         tilts = np.degrees([solution.tilts[view.name] for view in views[name]])
@@ -34,29 +35,31 @@ def camera_table(solution: Solution, views: dict[str, list[View]]) -> Table:
     return table
 
 
-def lens_lines(solution: Solution, depth: float, model: str) -> list[str]:
-    """What the lenses' own perspective costs, where it shows."""
+def perspective_messages(solution: Solution, depth: float, model: str) -> list[str]:
+    """Distance of each pinhole camera, or a warning for each orthographic camera whose views show perspective."""
     lines = []
-    for name, (nearness, sigma) in solution.nearness.items():
-        shown = nearness > PERSPECTIVE * sigma
+    for name, (inverse_distance, sigma) in solution.inverse_distances.items():
+        significant = inverse_distance > MIN_PERSPECTIVE_SIGMAS * sigma
         if model == "pinhole":
-            lines.append(f"camera {name}: stands {1.0 / nearness:.3f} +- {sigma / nearness**2:.3f} m from the origin")
-        elif shown and solution.bias(name, depth) > HARMLESS_BIAS:
             lines.append(
-                f"warning: camera {name}: its lens is not orthographic: it seems to stand {1.0 / nearness:.2f} m "
-                f"away, and a marker {1e3 * depth:.0f} mm off its plane is up to "
-                f"{1e3 * solution.bias(name, depth):.2f} mm wrong at the picture's edge; stand farther away with a "
-                "longer lens, or calibrate with --model pinhole"
+                f"camera {name}: {1.0 / inverse_distance:.3f} +- {sigma / inverse_distance**2:.3f} m from the origin"
+            )
+        elif significant and solution.perspective_bias(name, depth) > MAX_SILENT_BIAS_M:
+            lines.append(
+                f"warning: camera {name}: the images show perspective, as from {1.0 / inverse_distance:.2f} m away; "
+                f"at the image border, a marker {1e3 * depth:.0f} mm off its plane gets an error of up to "
+                f"{1e3 * solution.perspective_bias(name, depth):.2f} mm; move the camera farther away and use a longer "
+                "lens, or calibrate with --model pinhole"
             )
     return lines
 
 
 def check_table(rig: Rig, checked: dict[str, list[CheckedView]]) -> Table:
-    """Residuals of pictures that the calibration was not made from, by camera."""
-    table = Table("camera", "picture", "points", "residual [px]", "largest [px]", "calibration's [px]")
+    """Residuals of images that the calibration was not made from, beside the residual of the calibration."""
+    table = Table("camera", "image", "points", "residual [px]", "largest [px]", "in calibration [px]")
     for name, views in checked.items():
         for item in views:
             largest = float(np.linalg.norm(item.residual, axis=1).max())
-            numbers = (f"{item.size:.3f}", f"{largest:.3f}", f"{rig.cameras[name].residual:.3f}")
+            numbers = (f"{item.rms:.3f}", f"{largest:.3f}", f"{rig.cameras[name].residual:.3f}")
             table.add_row(name, item.view.name, str(len(item.residual)), *numbers)
     return table

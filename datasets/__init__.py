@@ -1,1 +1,1 @@
-"""Specimen descriptions and built dataset files; no code."""
+"""Descriptions of specimens and experiments, results, and built dataset files; no code."""

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from rafl.common.command_line import command_line, user_command
+from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 
@@ -13,12 +13,12 @@ METHODS = ("rafl", "srl", "sysid", "sysid-e", "sysid-damping")
 INTEGRATORS = ("implicit-euler", "generalised-alpha")
 DATASET = "a dataset (.h5, written by rafl-capture)"
 
-fit_app = command_line("Fit a model to recordings.")
-eval_app = command_line("Evaluate fitted models on recordings.")
+fit_app = create_app("Fit a model to recordings.")
+eval_app = create_app("Evaluate fitted models on recordings.")
 
 
 @fit_app.command()
-@user_command
+@report_errors
 def fit(
     datasets: Annotated[list[Path], typer.Argument(help="Dataset files (.h5) to train on.", metavar="DATASET...")],
     method: Annotated[
@@ -102,7 +102,7 @@ def fit(
 
 
 @eval_app.command()
-@user_command
+@report_errors
 def evaluate(
     paths: Annotated[
         list[Path], typer.Argument(help="Run folders and dataset files (.h5).", metavar="RUN... DATASET...")

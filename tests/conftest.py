@@ -1,4 +1,4 @@
-"""Specimens, datasets and recordings that several tests start from."""
+"""Fixtures that several tests share: a small specimen, a random generator, a runner of commands."""
 
 import contextlib
 import multiprocessing
@@ -9,24 +9,28 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support import Run, run_console_script
+
 from rafl.capture.specimen.specimen import Specimen, read_specimen
-from support import Run, enter_command
 
 
-def _forget_stale_kernels() -> None:
-    """numba renews a compiled function when its own file changes, not when one that it calls does."""
+def _delete_stale_kernels() -> None:
+    """Delete compiled kernels that are older than a source file.
+
+    numba compiles a function again if its own file changes, but not if a function changes that it calls.
+    """
     for package in ("rafl", "tracking", "capture"):
         folder = Path(__file__).parents[1] / package
         newest = max(path.stat().st_mtime for path in folder.rglob("*.py"))
         for compiled in folder.rglob("*.nb[ic]"):
-            with contextlib.suppress(FileNotFoundError):  # another worker was first
+            with contextlib.suppress(FileNotFoundError):  # another worker has deleted it
                 if compiled.stat().st_mtime < newest:
                     compiled.unlink()
 
 
-_forget_stale_kernels()
+_delete_stale_kernels()
 
-# Imports what commands need once; each of them is a fork of that.
+# The server process imports the modules once. Every command is a fork of it.
 COMMANDS = multiprocessing.get_context("forkserver")
 COMMANDS.set_forkserver_preload(["support", "rafl.capture.commands", "rafl.commands", "rafl.tracking.commands"])
 
@@ -65,13 +69,13 @@ def small_specimen(tmp_path_factory: pytest.TempPathFactory) -> Specimen:
 
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
-    """Run a command in a temporary folder and a process of its own, as a stranger would, imports made before."""
+    """Run a command in a temporary folder and in its own process, a fork of a process that has the imports."""
 
     def command(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
         line = [name, *map(str, arguments)]
         with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
             child = COMMANDS.Process(
-                target=enter_command, args=(line, tmp_path, DupFd(out.fileno()), DupFd(err.fileno()))
+                target=run_console_script, args=(line, tmp_path, DupFd(out.fileno()), DupFd(err.fileno()))
             )
             child.start()
             child.join(600)

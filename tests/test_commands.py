@@ -1,4 +1,4 @@
-"""What a stranger gets wrong: every command answers in one line, with exit code 2, and writes nothing."""
+"""The commands. A wrong input gives a one-line error and exit code 2, and no file is written."""
 
 import importlib.util
 import re
@@ -9,17 +9,17 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from support import Run, assert_refused, draw_frame
+
 from rafl.calibration.camera import OrthographicCamera, Plane
 from rafl.calibration.rig import Rig, write_rig
 from rafl.capture.dataset.build import CaptureSettings, build_dataset
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.capture.specimen.specimen import Specimen
-from support import Run, assert_refused, picture
-
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import write_dataset
-from rafl.data.synthetic import released
+from rafl.data.synthetic import release_dataset
 from rafl.fem.mesh import HexMesh
 from rafl.fitting.run_folder import FittedModel, save_model
 from rafl.residual.acceleration_field import ResidualField
@@ -41,12 +41,12 @@ def test_help_has_an_example(command: str, run: Run) -> None:
 
 @pytest.fixture
 def videos(tmp_path: Path) -> Path:
-    """One recording of one camera, as a folder of pictures: a 4 x 3 grid of dots that shifts a little."""
+    """Folder with one recording of one camera: images of a 4 x 3 marker grid that moves by 1 px per frame."""
     folder = tmp_path / "videos" / "swing"
     folder.mkdir(parents=True)
     for frame in range(6):
         dots = [(40 + 36 * i + frame, 40 + 36 * j, 6.0, 6.0, 0.0) for i in range(4) for j in range(3)]
-        cv2.imwrite(str(folder / f"{frame:03d}.png"), picture(dots, noise=1.0, seed=frame))
+        cv2.imwrite(str(folder / f"{frame:03d}.png"), draw_frame(dots, noise=1.0, seed=frame))
     write_rig(tmp_path / "calib.yaml", Rig({"front": camera()}))
     return tmp_path / "videos"
 
@@ -57,7 +57,7 @@ def camera(size: tuple[int, int] = (200, 160)) -> OrthographicCamera:
     )
 
 
-def test_tracking_a_folder_of_pictures(videos: Path, run: Run, tmp_path: Path) -> None:
+def test_track_a_folder_of_images(videos: Path, run: Run, tmp_path: Path) -> None:
     result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--overlay")
     assert result.returncode == 0, result.stderr
     with h5py.File(tmp_path / "tracks/swing.h5") as file:
@@ -69,7 +69,7 @@ def test_tracking_a_folder_of_pictures(videos: Path, run: Run, tmp_path: Path) -
     assert (tmp_path / "tracks/swing_front_overlay.mp4").stat().st_size > 1000
 
 
-def test_tracking_refuses(videos: Path, run: Run, tmp_path: Path) -> None:
+def test_track_refuses_wrong_input(videos: Path, run: Run, tmp_path: Path) -> None:
     before = folder_content(tmp_path)
 
     def refused(*parts: str, calib: str = "calib.yaml", path: Path = videos, more: tuple[str, ...] = ()) -> None:
@@ -91,8 +91,8 @@ def test_tracking_refuses(videos: Path, run: Run, tmp_path: Path) -> None:
     refused("--export", "'xlsx'", more=("--fps", "50", "--export", "csv,xlsx"))
 
 
-def test_a_damaged_picture_is_missing_and_named(videos: Path, run: Run, tmp_path: Path) -> None:
-    (videos / "swing" / "003.png").write_bytes(b"no picture")
+def test_damaged_image_is_reported_and_its_markers_are_missing(videos: Path, run: Run, tmp_path: Path) -> None:
+    (videos / "swing" / "003.png").write_bytes(b"not an image")
     result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--fill", "0")
     assert result.returncode == 0, result.stderr
     assert "frames 3 are damaged" in result.stdout
@@ -101,15 +101,15 @@ def test_a_damaged_picture_is_missing_and_named(videos: Path, run: Run, tmp_path
         assert (file["state"][3] == 0).all()
 
 
-def test_finished_recordings_are_kept_and_others_made_anew(videos: Path, run: Run, tmp_path: Path) -> None:
+def test_recordings_are_tracked_again_only_if_something_changed(videos: Path, run: Run, tmp_path: Path) -> None:
     command = ("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--export", "csv,c3d,trc,npy")
     assert run(*command).returncode == 0
     path = tmp_path / "tracks/swing.h5"
     first, time = path.read_bytes(), path.stat().st_mtime_ns
     again = run(*command)
-    assert "kept 1 recordings" in again.stdout
+    assert "kept the tracks of 1 recordings" in again.stdout
     assert path.stat().st_mtime_ns == time
-    # Not by name: a damaged file, or other settings, are no finished work.
+    # A damaged tracks file, or one with other settings, is not kept.
     path.write_bytes(first[: len(first) // 2])
     assert "kept" not in run(*command).stdout
     assert path.read_bytes() == first
@@ -118,15 +118,15 @@ def test_finished_recordings_are_kept_and_others_made_anew(videos: Path, run: Ru
     assert {item.name for item in (tmp_path / "tracks").iterdir()} == exports
 
 
-def test_too_few_markers_are_refused(videos: Path, run: Run, tmp_path: Path) -> None:
+def test_track_refuses_too_few_markers(videos: Path, run: Run, tmp_path: Path) -> None:
     for path in (videos / "swing").iterdir():
-        cv2.imwrite(str(path), picture([(60.0, 60.0, 6.0, 6.0, 0.0), (120.0, 60.0, 6.0, 6.0, 0.0)], noise=1.0))
+        cv2.imwrite(str(path), draw_frame([(60.0, 60.0, 6.0, 6.0, 0.0), (120.0, 60.0, 6.0, 6.0, 0.0)], noise=1.0))
     result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50")
     assert_refused(result, "swing", "at least 3 dots", "found 2")
     assert not (tmp_path / "tracks").exists()
 
 
-def test_one_failed_recording_does_not_stop_the_others(videos: Path, run: Run, tmp_path: Path) -> None:
+def test_other_recordings_are_tracked_after_a_failure(videos: Path, run: Run, tmp_path: Path) -> None:
     blank = videos / "blank"
     blank.mkdir()
     for frame in range(3):
@@ -140,7 +140,7 @@ def test_one_failed_recording_does_not_stop_the_others(videos: Path, run: Run, t
 @pytest.fixture(scope="module")
 def built(small_specimen: Specimen, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp("arrays")
-    return build_dataset(small_specimen, authors_arrays(small_specimen, folder), ROWS, SETTINGS, "", lambda: None)
+    return build_dataset(small_specimen, write_author_arrays(small_specimen, folder), ROWS, SETTINGS, "", lambda: None)
 
 
 SETTINGS = CaptureSettings(2e-3, 3e-3, 100.0)
@@ -150,7 +150,8 @@ ROWS = [
 ]
 
 
-def authors_arrays(specimen: Specimen, folder: Path) -> Path:
+def write_author_arrays(specimen: Specimen, folder: Path) -> Path:
+    """Write simulated markers as `q0.npy` and `q1.npy`, arrays in the format of the paper's authors."""
     import torch
 
     markers = specimen.markers(1e-6)
@@ -162,20 +163,22 @@ def authors_arrays(specimen: Specimen, folder: Path) -> Path:
 
 
 @pytest.fixture
-def capture_line(small_specimen: Specimen, specimen_file: Path, tmp_path: Path) -> tuple[str | Path, ...]:
-    """The command that builds a.h5 from the authors' arrays and the table of one recording beside it."""
-    authors_arrays(small_specimen, tmp_path)
+def capture_command(small_specimen: Specimen, specimen_file: Path, tmp_path: Path) -> tuple[str | Path, ...]:
+    """The command that builds a.h5 from arrays and a table of one recording, both in the temporary folder."""
+    write_author_arrays(small_specimen, tmp_path)
     table = tmp_path / "recordings.csv"
     table.write_text("recording,load_g,split\nq0,50,train\n")
     return ("rafl-capture", specimen_file, tmp_path, "--recordings", table, "--out", "a.h5")
 
 
-def test_capture_refuses(capture_line: tuple[str | Path, ...], specimen_file: Path, run: Run, tmp_path: Path) -> None:
+def test_capture_refuses_wrong_input(
+    capture_command: tuple[str | Path, ...], specimen_file: Path, run: Run, tmp_path: Path
+) -> None:
     table = tmp_path / "recordings.csv"
     table.write_text("recording,load_g,split\nq0,50,train\nq1,70,test\n")
 
     def refused(*parts: str) -> None:
-        assert_refused(run(*capture_line), *parts)
+        assert_refused(run(*capture_command), *parts)
         assert not list(tmp_path.glob("*a*.h5"))
 
     text = specimen_file.read_text()
@@ -192,29 +195,28 @@ def test_capture_refuses(capture_line: tuple[str | Path, ...], specimen_file: Pa
     refused("recordings.csv", "found nothing")
 
 
-def test_a_failed_capture_leaves_the_old_dataset(
-    capture_line: tuple[str | Path, ...], run: Run, tmp_path: Path
+def test_failed_capture_keeps_the_old_dataset(
+    capture_command: tuple[str | Path, ...], run: Run, tmp_path: Path
 ) -> None:
-    assert run(*capture_line).returncode == 0
+    assert run(*capture_command).returncode == 0
     assert "data:image/png" in (tmp_path / "a.html").read_text()
     before = (tmp_path / "a.h5").read_bytes()
     (tmp_path / "q0.npy").write_bytes(b"broken")
-    assert_refused(run(*capture_line), "q0.npy", "cannot be read")
+    assert_refused(run(*capture_command), "q0.npy", "cannot be read")
     assert (tmp_path / "a.h5").read_bytes() == before
 
 
-def test_a_dataset_is_looked_at_verified_and_added_to(
-    capture_line: tuple[str | Path, ...], specimen_file: Path, run: Run, tmp_path: Path
+def test_update_inspect_and_verify_a_dataset(
+    capture_command: tuple[str | Path, ...], specimen_file: Path, run: Run, tmp_path: Path
 ) -> None:
-    line = capture_line
-    assert run(*line).returncode == 0
+    assert run(*capture_command).returncode == 0
     (tmp_path / "recordings.csv").write_text("recording,load_g,split\nq1,70,test\n")
-    assert_refused(run(*line), "split `train`")
-    assert run(*line, "--update").returncode == 0
-    said = run("rafl-capture", "--inspect", "a.h5")
-    assert said.returncode == 0, said.stderr
+    assert_refused(run(*capture_command), "split `train`")
+    assert run(*capture_command, "--update").returncode == 0
+    result = run("rafl-capture", "--inspect", "a.h5")
+    assert result.returncode == 0, result.stderr
     for part in ("small: 63 vertices, 24 elements", "train 1, val 0, test 1", "q0.npy", "E = 150000 Pa", "SI: m, s"):
-        assert part in " ".join(said.stdout.split()), said.stdout
+        assert part in " ".join(result.stdout.split()), result.stdout
     assert "as they were written" in run("rafl-capture", "--verify", "a.h5").stdout
     with h5py.File(tmp_path / "a.h5", "r+") as file:
         file["trajectories/q1"].attrs["load_g"] = 71.0
@@ -222,11 +224,11 @@ def test_a_dataset_is_looked_at_verified_and_added_to(
     assert_refused(run("rafl-capture", "--verify", specimen_file), "cannot be read")
     assert_refused(run("rafl-capture", "--inspect", "nowhere.h5"), "nowhere.h5")
     assert_refused(run("rafl-capture", specimen_file), "for instance rafl-capture")
-    assert_refused(run(*line, "--update", "--rest", "q0:x"), "straight:12-40")
-    assert_refused(run(*line[:-1], "new.h5", "--update"), "new.h5", "nothing there")
+    assert_refused(run(*capture_command, "--update", "--rest", "q0:x"), "straight:12-40")
+    assert_refused(run(*capture_command[:-1], "new.h5", "--update"), "new.h5", "nothing there")
 
 
-def test_fit_and_eval_refuse(built: Dataset, run: Run, tmp_path: Path) -> None:
+def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Path) -> None:
     write_dataset(tmp_path / "a.h5", built)
     with h5py.File(tmp_path / "a.h5", "r+") as file:
         file.attrs["format"] = "rafl-dataset/7"
@@ -256,65 +258,70 @@ def test_fit_and_eval_refuse(built: Dataset, run: Run, tmp_path: Path) -> None:
     assert_refused(run("rafl-eval", "run", "a.h5"), "model.pt", "cannot be read")
 
 
-def test_tensorboard_is_written_or_asked_for(built: Dataset, run: Run, tmp_path: Path) -> None:
-    """Where the optional package is absent nothing is written."""
+def test_tensorboard_option(built: Dataset, run: Run, tmp_path: Path) -> None:
+    """The option writes events, or asks for the package if it is not installed."""
     write_dataset(tmp_path / "a.h5", built)
-    said = run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1", "--frames", "3", "--tensorboard")
+    result = run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1", "--frames", "3", "--tensorboard")
     if importlib.util.find_spec("tensorboard") is None:
-        assert_refused(said, "package tensorboard", "history.csv")
+        assert_refused(result, "package tensorboard", "history.csv")
         assert not (tmp_path / "run").exists()
     else:
-        assert said.returncode == 0, said.stderr
+        assert result.returncode == 0, result.stderr
         assert list((tmp_path / "run").glob("events.out.tfevents.*"))
 
 
-def test_a_model_of_another_mesh_is_left_out_and_a_model_of_none_refused(
-    built: Dataset, run: Run, tmp_path: Path
-) -> None:
-    """Whatever its place on the command line, and it counts only where it acts."""
+def test_eval_of_models_not_applicable_to_a_mesh(built: Dataset, run: Run, tmp_path: Path) -> None:
+    """Eval refuses a model applicable to no dataset, and leaves a model out on datasets with another mesh."""
     write_dataset(tmp_path / "small.h5", built)
     save_model(tmp_path / "srl", FittedModel("srl", network=GlobalResidual(7)))
     save_model(tmp_path / "sysid", FittedModel("sysid", material={"youngs_modulus": 190e3, "poissons_ratio": 0.45}))
-    assert_refused(run("rafl-eval", "srl", "small.h5"), "srl: expected the mesh")
-    assert_refused(run("rafl-eval", "srl", "sysid", "small.h5"), "srl: expected the mesh")
-    said = run("rafl-eval", "sysid", "small.h5")
-    assert said.returncode == 0, said.stderr
-    assert "sysid: worse than the original simulator on 1 of 1 datasets" in said.stdout
+    assert_refused(run("rafl-eval", "srl", "small.h5"), "srl: expected the training mesh")
+    assert_refused(run("rafl-eval", "srl", "sysid", "small.h5"), "srl: expected the training mesh")
+    result = run("rafl-eval", "sysid", "small.h5")
+    assert result.returncode == 0, result.stderr
+    assert "sysid: worse than the baseline simulator on 1 of 1 datasets" in result.stdout
     other = replace(built.simulator, mesh=HexMesh.box((2, 1, 1), (0.02, 0.01, 0.01)), fixed=np.arange(4))
-    write_dataset(tmp_path / "other.h5", released("other", other, other, other.mesh.vertices[None], 3, {"a": "test"}))
+    write_dataset(
+        tmp_path / "other.h5", release_dataset("other", other, other, other.mesh.vertices[None], 3, {"a": "test"})
+    )
     save_model(tmp_path / "srl", FittedModel("srl", network=GlobalResidual(12)))
-    said = run("rafl-eval", "srl", "sysid", "small.h5", "other.h5", "--out", "both")
-    assert said.returncode == 0, said.stderr
-    assert re.search(r"srl: worse than the original simulator on \d of 1 datasets", said.stdout)
-    assert re.search(r"held-out marker error: original [\d.]+ mm, sysid [\d.]+ mm", said.stdout)
+    result = run("rafl-eval", "srl", "sysid", "small.h5", "other.h5", "--out", "both")
+    assert result.returncode == 0, result.stderr
+    assert re.search(r"srl: worse than the baseline simulator on \d of 1 datasets", result.stdout)
+    assert re.search(r"held-out marker error: original [\d.]+ mm, sysid [\d.]+ mm", result.stdout)
     assert not (tmp_path / "run" / "errors.csv").exists()
 
 
-def test_a_model_whose_simulation_fails_is_left_out_there_and_said(built: Dataset, run: Run, tmp_path: Path) -> None:
-    """The others are compared all the same."""
+def test_eval_of_models_whose_simulation_fails(built: Dataset, run: Run, tmp_path: Path) -> None:
+    """A model is left out where its simulation fails; if it fails everywhere, eval fails."""
     write_dataset(tmp_path / "small.h5", built)
-    still = replace(built.simulator, gravity=(0.0, 0.0, 0.0))
-    write_dataset(tmp_path / "still.h5", released("still", still, still, still.mesh.vertices[None], 3, {"a": "test"}))
+    weightless = replace(built.simulator, gravity=(0.0, 0.0, 0.0))
+    write_dataset(
+        tmp_path / "weightless.h5",
+        release_dataset("weightless", weightless, weightless, weightless.mesh.vertices[None], 3, {"a": "test"}),
+    )
     field = ResidualField()
     field.load_state_dict({key: 30.0 * value for key, value in field.state_dict().items()})
-    save_model(tmp_path / "wild", FittedModel("rafl", field=field))
+    save_model(tmp_path / "unstable", FittedModel("rafl", field=field))
     save_model(tmp_path / "good", FittedModel("sysid-e", material={"youngs_modulus": 190e3, "poissons_ratio": 0.45}))
-    save_model(tmp_path / "odd", FittedModel("rafl", field=field, stepping={"integrator": "magic", "substeps": 1}))
+    save_model(
+        tmp_path / "odd", FittedModel("rafl", field=field, time_integration={"integrator": "magic", "substeps": 1})
+    )
     assert_refused(run("rafl-eval", "odd", "small.h5"), "model.pt", "integrator", "magic")
-    said = run("rafl-eval", "wild", "small.h5")
-    assert said.returncode == 1
-    assert "error: rafl on small: step 1" in said.stderr
-    assert not (tmp_path / "wild" / "errors.csv").exists()
-    said = run("rafl-eval", "good", "wild", "small.h5", "still.h5")
-    assert said.returncode == 0, said.stderr
-    assert "left out on small: rafl" in said.stderr
+    result = run("rafl-eval", "unstable", "small.h5")
+    assert result.returncode == 1
+    assert "error: rafl on small: step 1" in result.stderr
+    assert not (tmp_path / "unstable" / "errors.csv").exists()
+    result = run("rafl-eval", "good", "unstable", "small.h5", "weightless.h5")
+    assert result.returncode == 0, result.stderr
+    assert "left out on small: rafl" in result.stderr
     assert re.search(
-        r"rafl: worse than the original simulator on \d of 1 datasets; its simulation fails on 1 more", said.stdout
+        r"rafl: worse than the baseline simulator on \d of 1 datasets; its simulation fails on 1 more", result.stdout
     )
     assert (tmp_path / "good" / "report.html").exists()
 
 
-def test_render_refuses(specimen_file: Path, run: Run, tmp_path: Path) -> None:
+def test_render_refuses_wrong_input(specimen_file: Path, run: Run, tmp_path: Path) -> None:
     assert_refused(run("rafl-render", "nowhere.yaml", "--out", "film"), "nowhere.yaml")
     assert_refused(run("rafl-render", specimen_file, "--out", "film", "--loads-g", "5O"), "--loads-g", "'5O'")
     assert_refused(run("rafl-render", specimen_file, "--out", "film", "--loads-g", ""), "at least one recording")
@@ -328,17 +335,17 @@ def test_render_refuses(specimen_file: Path, run: Run, tmp_path: Path) -> None:
     assert_refused(run("rafl-render", specimen_file, "--out", "film"), "found files in it")
 
 
-def test_what_a_method_cannot_be_fitted_to_is_refused_before_anything_is_written(
-    built: Dataset, run: Run, tmp_path: Path
-) -> None:
+def test_fit_refuses_unsuitable_datasets_before_it_writes(built: Dataset, run: Run, tmp_path: Path) -> None:
     mesh = HexMesh.box((3, 2, 2), (0.03, 0.02, 0.02))
     other = replace(built.simulator, mesh=mesh, fixed=mesh.face_nodes("x-min"))
     write_dataset(tmp_path / "a.h5", built)
-    write_dataset(tmp_path / "b.h5", released("b", other, other, mesh.vertices[None], 3, {"a": "train"}))
+    write_dataset(tmp_path / "b.h5", release_dataset("b", other, other, mesh.vertices[None], 3, {"a": "train"}))
     assert_refused(run("rafl-fit", "a.h5", "b.h5", "--method", "srl", "--out", "run"), "srl", "one mesh", "36")
     assert_refused(run("rafl-fit", "a.h5", "--integrator", "euler", "--out", "run"), "implicit-euler", "'euler'")
     write_dataset(tmp_path / "c.h5", replace(built, name="c", simulator=replace(built.simulator, substeps=2)))
-    assert_refused(run("rafl-fit", "a.h5", "c.h5", "--out", "run"), "step alike", "c: implicit-euler, 2 substeps")
+    assert_refused(
+        run("rafl-fit", "a.h5", "c.h5", "--out", "run"), "same time integration", "c: implicit-euler, 2 substeps"
+    )
     assert_refused(run("rafl-fit", "a.h5", "--method", "magic", "--out", "run"), "--method", "sysid-e", "magic")
     assert_refused(run("rafl-fit", "a.h5", "--from", "nowhere", "--out", "run"), "nowhere", "check the path")
     assert not (tmp_path / "run").exists()

@@ -5,21 +5,21 @@ from typing import Annotated
 
 import typer
 
-from rafl.common.command_line import command_line, user_command
+from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file, require_folder
 
-MODELS = ("orthographic", "pinhole")
-EXPORTS = ("csv", "c3d", "trc", "npy")
-CALIBRATION = "a calibration (calib.yaml, written by rafl-calibrate)"
-SPECIMEN = "a specimen description (specimen.yaml)"
+CAMERA_MODELS = ("orthographic", "pinhole")
+EXPORT_FORMATS = ("csv", "c3d", "trc", "npy")
+CALIBRATION_LABEL = "a calibration (calib.yaml, written by rafl-calibrate)"
+SPECIMEN_LABEL = "a specimen description (specimen.yaml)"
 
-calibrate_app = command_line("Calibrate cameras.")
-track_app = command_line("Track markers in videos.")
+calibrate_app = create_app("Calibrate cameras.")
+track_app = create_app("Track markers in videos.")
 
 
 @calibrate_app.command()
-@user_command
+@report_errors
 def calibrate(
     images: Annotated[Path | None, typer.Argument(help="Folder with one subfolder of board images per camera.")] = None,
     board: Annotated[Path | None, typer.Option(help="Board description [IMAGES/board.yaml].")] = None,
@@ -32,18 +32,19 @@ def calibrate(
     ] = None,
     face: Annotated[
         list[str] | None,
-        typer.Option(help="With --from-rest: the face that a camera films, for instance left=y-min."),
+        typer.Option(help="With --from-rest: the face of the specimen that a camera films, for instance left=y-min."),
     ] = None,
     out: Annotated[Path, typer.Option(help="Calibration to write.")] = Path("calib.yaml"),
     model: Annotated[str, typer.Option(help="Camera model: orthographic or pinhole.")] = "orthographic",
     tilt_sign: Annotated[
         list[str] | None,
         typer.Option(
-            help="CAMERA=+ if the right (or lower) edge of its reference board is farther away, else CAMERA=-."
+            help="Only if asked for: CAMERA=+ if the right (or lower) edge of its reference board is farther away, "
+            "else CAMERA=-."
         ),
     ] = None,
     depth_mm: Annotated[
-        float, typer.Option(min=0.0, help="Depth of the specimen [mm], for the perspective check.")
+        float, typer.Option(min=0.0, help="Depth of the specimen [mm], for the perspective warning.")
     ] = 30.0,
     check: Annotated[
         Path | None, typer.Option(help="Check this calib.yaml against the images instead of calibrating.")
@@ -53,12 +54,12 @@ def calibrate(
 
     Example: rafl-calibrate calibration-images/ --out calib.yaml
 
-    Without a board: rafl-calibrate --from-rest rest/ --specimen specimen.yaml --face left=y-min
+    Example without a board: rafl-calibrate --from-rest rest/ --specimen specimen.yaml --face left=y-min
 
-    With --check CALIB nothing is calibrated: the residuals are of images that the calibration was not made from.
+    With --check CALIB, nothing is calibrated. The command tests CALIB on images that it was not made from.
     """
-    if model not in MODELS:
-        raise InputError(f"--model: expected {' or '.join(MODELS)}, found {model!r}")
+    if model not in CAMERA_MODELS:
+        raise InputError(f"--model: expected {' or '.join(CAMERA_MODELS)}, found {model!r}")
     if (images is None) == (from_rest is None):
         raise InputError("expected a folder of board images, or --from-rest and a folder of videos; give one of them")
     if from_rest is not None:
@@ -67,7 +68,7 @@ def calibrate(
         if specimen is None:
             raise InputError("--from-rest: expected --specimen specimen.yaml, which gives the marker positions")
         require_folder(from_rest, "a folder with one video per camera")
-        require_file(specimen, SPECIMEN)
+        require_file(specimen, SPECIMEN_LABEL)
         from rafl.tracking import commands
 
         commands.calibrate_from_rest(from_rest, specimen, face or [], tilt_sign or [], out)
@@ -78,7 +79,7 @@ def calibrate(
     require_folder(images, "a folder of board images")
     board = require_file(board or images / "board.yaml", "a board description (board.yaml)")
     if check is not None:
-        require_file(check, CALIBRATION)
+        require_file(check, CALIBRATION_LABEL)
     from rafl.tracking import commands
 
     if check is not None:
@@ -88,16 +89,18 @@ def calibrate(
 
 
 @track_app.command()
-@user_command
+@report_errors
 def track(
     videos: Annotated[Path, typer.Argument(help="Folder of videos (or of image folders), or one video.")],
     calib: Annotated[Path, typer.Option(help="Calibration (calib.yaml).")],
-    specimen: Annotated[Path | None, typer.Option(help="specimen.yaml, which names the markers.")] = None,
+    specimen: Annotated[
+        Path | None, typer.Option(help="specimen.yaml, which names the markers [row and column].")
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the tracks.")] = Path("tracks"),
-    fps: Annotated[float | None, typer.Option(min=0.1, help="True frames per second [as the video says].")] = None,
+    fps: Annotated[float | None, typer.Option(min=0.1, help="True frame rate [1/s] [as in the video file].")] = None,
     fill: Annotated[int, typer.Option(min=0, help="Longest gap to fill [frames].")] = 5,
     sync: Annotated[bool, typer.Option("--sync", help="Find the time offsets of the cameras from the motion.")] = False,
-    export: Annotated[str, typer.Option(help="Also export csv, c3d, trc or npy; separated by commas.")] = "",
+    export: Annotated[str, typer.Option(help="Also export the tracks: csv, c3d, trc, npy, separated by commas.")] = "",
     overlay: Annotated[
         bool, typer.Option("--overlay", help="Also write videos with the markers and their names drawn in.")
     ] = False,
@@ -113,13 +116,13 @@ def track(
     """
     exports = [kind.strip().lower() for kind in export.split(",") if kind.strip()]
     for kind in exports:
-        if kind not in EXPORTS:
-            raise InputError(f"--export: expected some of {', '.join(EXPORTS)}, found {kind!r}")
+        if kind not in EXPORT_FORMATS:
+            raise InputError(f"--export: expected some of {', '.join(EXPORT_FORMATS)}, found {kind!r}")
     if not videos.exists():
         raise InputError(f"expected videos at {videos}, found nothing there; check the path")
-    require_file(calib, CALIBRATION)
+    require_file(calib, CALIBRATION_LABEL)
     if specimen is not None:
-        require_file(specimen, SPECIMEN)
+        require_file(specimen, SPECIMEN_LABEL)
     from rafl.tracking import commands
 
     commands.track(videos, calib, specimen, out, fps, fill, sync, exports, overlay, jobs)

@@ -18,22 +18,22 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from rafl.calibration.board import read_board
-from rafl.calibration.board_images import board_views, check_placed
+from rafl.calibration.board_images import board_views, check_shared_world
 from rafl.calibration.camera import Camera
 from rafl.calibration.rig import Rig, read_rig, write_rig
 from rafl.calibration.solve import solve_rig
-from rafl.calibration.summary import camera_table, check_table, lens_lines
-from rafl.calibration.validation import check_view, write_picture
+from rafl.calibration.summary import camera_table, check_table, perspective_messages
+from rafl.calibration.validation import check_view, write_residual_plot
 from rafl.common.command_line import progress
 from rafl.common.errors import InputError
 from rafl.common.kernels import announce_compilation
 from rafl.tracking.linking.layout import read_layout
 from rafl.tracking.overlay import write_overlay
-from rafl.tracking.pipeline import TrackingSettings, finished, track_recording
+from rafl.tracking.pipeline import TrackingSettings, existing_tracks, track_recording
 from rafl.tracking.reconstruction.export import WRITERS, export_name
 from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 from rafl.tracking.report import summary_cells, write_report
-from rafl.tracking.rest import FACES, camera_at_rest, rest_videos
+from rafl.tracking.rest import FACES, open_rest_videos, solve_rest_camera
 from rafl.tracking.video.reader import Video
 from rafl.tracking.video.recordings import find_recordings
 
@@ -59,11 +59,11 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
     """
     description = read_board(board)
     views, sizes = board_views(images, description)
-    check_placed(views)
+    check_shared_world(views)
     solution = solve_rig(views, sizes, description, _tilt_signs(tilt_sign, list(views)), model)
     write_rig(out, solution.rig)
     Console(width=110).print(camera_table(solution, views))
-    for line in lens_lines(solution, depth, model):
+    for line in perspective_messages(solution, depth, model):
         typer.echo(line)
     _print_next(out)
 
@@ -83,7 +83,7 @@ def calibrate_from_rest(folder: Path, specimen: Path, face: list[str], tilt_sign
     """
     announce_compilation()
     layout = read_layout(specimen)
-    videos = rest_videos(folder)
+    videos = open_rest_videos(folder)
     faces = _values_by_camera("--face", face, list(videos), tuple(FACES))
     signs = _tilt_signs(tilt_sign, list(videos))
     table = Table("camera", "face", "markers", "residual [px]", "px/mm", "+-", "tilt [deg]")
@@ -92,11 +92,13 @@ def calibrate_from_rest(folder: Path, specimen: Path, face: list[str], tilt_sign
         for name, video in videos.items():
             task = bar.add_task(name, total=video.frames or None)
             tick = partial(bar.advance, task)
-            view = camera_at_rest(name, video, layout, faces.get(name), signs.get(name), tick)
-            camera, found = view.found.camera, view.found
+            view = solve_rest_camera(name, video, layout, faces.get(name), signs.get(name), tick)
+            camera, fit = view.fit.camera, view.fit
             cameras[name] = camera
             assert camera.covariance
-            tilt = f"below {np.degrees(found.unsure):.1f}" if found.unsure else f"{np.degrees(found.tilt):.1f}"
+            tilt = (
+                f"below {np.degrees(fit.undetected_tilt):.1f}" if fit.undetected_tilt else f"{np.degrees(fit.tilt):.1f}"
+            )
             numbers = (
                 f"{camera.residual:.3f}",
                 f"{1e-3 * camera.scale[0]:.4f}",
@@ -133,7 +135,7 @@ def check_calibration(calib: Path, images: Path, board: Path) -> None:
             placed = bar.track(own, description=f"{name}: locating the board")
             checked[name] = [check_view(camera, view) for view in placed]
         path = Path(f"check-{name}.png")
-        write_picture(path, camera.image_size, checked[name], name)
+        write_residual_plot(path, camera.image_size, checked[name], name)
         typer.echo(f"wrote {path}")
     Console(width=110).print(check_table(rig, checked))
 
@@ -271,7 +273,7 @@ def _track_one(
     stopped: threading.Event,
 ) -> tuple[Tracks, bool]:
     """The tracks of one recording, and whether they were there before."""
-    before = finished(path, sources, rig, settings)
+    before = existing_tracks(path, sources, rig, settings)
     if before is not None:
         return before, True
     total = sum(video.frames for video in sources.values())

@@ -1,8 +1,9 @@
-"""`report.html` of tracks: one file that shows what was seen, what was filled and where to look twice."""
+"""`report.html` of tracks: measured, filled and missing markers, residuals, and the frames to check, in one file."""
 
 import base64
 import io
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jinja2
@@ -11,14 +12,16 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+
 from rafl.calibration.rig import Rig
-from rafl.tracking.overlay import annotate, shown_pixels
+from rafl.common.files import write_text
+from rafl.tracking.overlay import annotate, display_pixels
 from rafl.tracking.reconstruction.gap_filling import FILLED, MEASURED, MISSING
 from rafl.tracking.reconstruction.tracks import Tracks
 
-from rafl.common.files import write_text
+Array = NDArray[Any]
 
-WIDEST = 900
+MAX_WIDTH_PX = 900  # of a frame in the report
 STATE_COLOURS = ["#c0392b", "#4c9f70", "#e6a23c"]  # missing, measured, filled
 
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>Tracks</title>
@@ -42,22 +45,22 @@ Orange: filled. Red: missing.</figcaption></figure>
 {% for c in r.cameras %}
 <h3>Camera {{ c.name }}</h3>
 <figure><img alt="first frame" src="data:image/jpeg;base64,{{ c.first }}"><figcaption class="note">Frame
-{{ c.first_number }}, the first, with the names given.</figcaption></figure>
+{{ c.first_number }}, the first, with the marker names.</figcaption></figure>
 <img alt="residuals" src="data:image/png;base64,{{ c.histogram }}">
-{% if c.worst %}<p class="note">The frames in which most markers were lost or worst located:</p>
-<div class="strip">{% for w in c.worst %}<figure><img alt="frame" src="data:image/jpeg;base64,{{ w.picture }}">
-<figcaption class="note">frame {{ w.number }}: {{ w.seen }} of {{ w.all }} seen, largest sigma
+{% if c.worst %}<p class="note">The frames with the most missing or least certain markers:</p>
+<div class="strip">{% for w in c.worst %}<figure><img alt="frame" src="data:image/jpeg;base64,{{ w.image }}">
+<figcaption class="note">frame {{ w.number }}: {{ w.seen }} of {{ w.all }} markers seen, largest sigma
 {{ w.sigma }} px</figcaption></figure>{% endfor %}</div>{% endif %}
 {% endfor %}{% endfor %}
-<p class="note">Uncertainties are one standard deviation, from each dot's own fit.</p></html>
+<p class="note">Sigma is one standard deviation of a coordinate, estimated from the fit of each dot.</p></html>
 """
 
 
 def summary_cells(tracks: Tracks) -> list[str]:
-    """Frames, markers, shares measured, filled and missing, median sigma and residual, as text."""
+    """Numbers of frames and markers, shares measured, filled and missing, median sigma and RMS residual, as text."""
     state = tracks.state
     sigma = np.concatenate([values[np.isfinite(values)] for values in tracks.pixel_sigma.values()])
-    residual = np.concatenate([_compared(tracks, camera) for camera in tracks.residual])
+    residual = np.concatenate([_shared_residuals(tracks, camera) for camera in tracks.residual])
     return [
         str(len(tracks.time)),
         str(len(tracks.names)),
@@ -67,21 +70,22 @@ def summary_cells(tracks: Tracks) -> list[str]:
     ]
 
 
-def _compared(tracks: Tracks, camera: str) -> NDArray:
-    """One camera's residuals [px] where another sees the marker too: what one alone sees has nothing to differ from."""
+def _shared_residuals(tracks: Tracks, camera: str) -> Array:
+    """One camera's residuals [px] of markers that another camera sees too; otherwise a residual is meaningless."""
     seen = np.sum([np.isfinite(residual) for residual in tracks.residual.values()], axis=0)
-    return tracks.residual[camera][np.isfinite(tracks.residual[camera]) & (seen > 1)]
+    result: Array = tracks.residual[camera][np.isfinite(tracks.residual[camera]) & (seen > 1)]
+    return result
 
 
 def write_report(path: Path, tracks: dict[str, Tracks], rig: Rig) -> None:
-    """Write the report on all recordings, whole or not at all."""
+    """Write the report on all recordings, completely or not at all."""
     recordings = [
         {
             "name": name,
             "cells": summary_cells(item),
             "notes": item.notes,
             "timeline": _timeline(item),
-            "cameras": [_camera(item, camera, rig) for camera in item.pixel],
+            "cameras": [_camera_section(item, camera, rig) for camera in item.pixel],
         }
         for name, item in tracks.items()
     ]
@@ -89,20 +93,20 @@ def write_report(path: Path, tracks: dict[str, Tracks], rig: Rig) -> None:
     write_text(path, page.render(recordings=recordings))
 
 
-def _camera(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
-    pixel = shown_pixels(tracks, name, rig.cameras[name])
-    pictures = tracks.pictures[name]
-    first = min(pictures)
+def _camera_section(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
+    pixel = display_pixels(tracks, name, rig.cameras[name])
+    images = tracks.images[name]
+    first = min(images)
     sigma = tracks.pixel_sigma[name]
-    row_of = tracks.rows(name)
+    row_of = tracks.rows_by_frame(name)
     worst = []
-    for number in sorted(set(pictures) & set(row_of) - {first}):
+    for number in sorted(set(images) & set(row_of) - {first}):
         row = row_of[number]
         seen = np.isfinite(sigma[row, :, 0])
         worst.append(
             {
                 "number": number,
-                "picture": _picture(pictures[number], tracks, pixel, row),
+                "image": _annotated_jpeg(images[number], tracks, pixel, row),
                 "seen": int(seen.sum()),
                 "all": len(seen),
                 "sigma": f"{np.nanmax(sigma[row]):.2f}" if seen.any() else "-",
@@ -110,20 +114,21 @@ def _camera(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
         )
     return {
         "name": name,
-        "first": _picture(pictures[first], tracks, pixel, row_of.get(first, 0)),
+        "first": _annotated_jpeg(images[first], tracks, pixel, row_of.get(first, 0)),
         "first_number": first,
         "histogram": _histogram(tracks, name),
         "worst": worst,
     }
 
 
-def _picture(content: bytes, tracks: Tracks, pixel: NDArray, row: int) -> str:
+def _annotated_jpeg(content: bytes, tracks: Tracks, pixel: Array, row: int) -> str:
+    """A stored frame with its markers and trails drawn in, as a base64 JPEG."""
     grey = np.asarray(cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_GRAYSCALE))
-    shrink = min(1.0, WIDEST / grey.shape[1])
+    shrink = min(1.0, MAX_WIDTH_PX / grey.shape[1])
     small = cv2.resize(grey, None, fx=shrink, fy=shrink, interpolation=cv2.INTER_AREA)
     trails = shrink * pixel[max(row - 10, 0) : row + 1]
-    shown = annotate(small, shrink * pixel[row], tracks.state[row] == FILLED, tracks.names, trails)
-    jpeg = cv2.imencode(".jpg", cv2.cvtColor(shown, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
+    annotated = annotate(small, shrink * pixel[row], tracks.state[row] == FILLED, tracks.names, trails)
+    jpeg = cv2.imencode(".jpg", cv2.cvtColor(annotated, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 80])[1]
     return base64.b64encode(jpeg.tobytes()).decode()
 
 
@@ -149,14 +154,14 @@ def _timeline(tracks: Tracks) -> str:
 def _histogram(tracks: Tracks, name: str) -> str:
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 2.4), layout="constrained")
     sigma = tracks.pixel_sigma[name]
-    for axes, values, label, nothing in (
-        (left, _compared(tracks, name), "reprojection residual [px]", "no marker is seen by another camera too"),
+    for axes, values, label, empty_text in (
+        (left, _shared_residuals(tracks, name), "reprojection residual [px]", "no marker is seen by two cameras"),
         (right, sigma[np.isfinite(sigma)], "standard deviation of a coordinate [px]", "no marker is seen"),
     ):
         if len(values):
             axes.hist(values, bins=60, range=(0.0, float(np.quantile(values, 0.995)) + 1e-9), color="#1f6fb2")
         else:
-            axes.text(0.5, 0.5, nothing, ha="center", va="center", transform=axes.transAxes, color="#666666")
+            axes.text(0.5, 0.5, empty_text, ha="center", va="center", transform=axes.transAxes, color="#666666")
             axes.set_xticks([])
         axes.set_xlabel(label)
         axes.set_yticks([])

@@ -1,4 +1,4 @@
-"""Cameras from a specimen at rest: its dots found in one video each, named, and held against their layout."""
+"""Camera calibration from videos of the specimen at rest: find and name its markers, then fit the camera."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
 from rafl.calibration.camera import OrthographicCamera
-from rafl.calibration.rest_pose import FEWEST_POINTS, RestCamera, camera_from_points
+from rafl.calibration.rest_pose import MIN_POINTS, RestCamera, camera_from_points
+from rafl.common.errors import InputError
 from rafl.tracking.linking.follow import follow
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.linking.naming import name_by_layout, visible_markers
 from rafl.tracking.video.reader import Video, is_video, natural_key, open_video
-from scipy.spatial import cKDTree
-from scipy.spatial.transform import Rotation
-
-from rafl.common.errors import InputError
 
 Array = NDArray[Any]
 
-FACES = {  # by the face filmed, the line of sight
+FACES = {  # line of sight of a camera that films the face
     "x-min": (1.0, 0.0, 0.0),
     "x-max": (-1.0, 0.0, 0.0),
     "y-min": (0.0, 1.0, 0.0),
@@ -28,31 +28,31 @@ FACES = {  # by the face filmed, the line of sight
     "z-min": (0.0, 0.0, 1.0),
     "z-max": (0.0, 0.0, -1.0),
 }
-AT_REST = 1.0  # px: a dot that moves farther than this is not at rest
-DEEP = 0.1  # of the width: a face seen narrower than this is seen from its edge
-ALIKE = 1.5  # times the residual: faces whose misfits differ by less cannot be told apart
+MAX_MOTION_PX = 1.0  # a dot that moves farther is not at rest
+MIN_ASPECT = 0.1  # width over length of the imaged markers; below it, the camera sees the face edge-on
+MISFIT_RATIO = 1.5  # faces whose misfits are within this factor of the best cannot be distinguished
 
 
 @dataclass(frozen=True)
 class RestView:
-    """What one camera's video of the specimen at rest gave.
+    """A camera calibrated from its video of the specimen at rest.
 
     Attributes:
-        found: the camera.
-        face: of the specimen that it films.
-        markers: how many of the layout's it named.
+        fit: the fitted camera.
+        face: the face of the specimen that the camera films.
+        markers: number of the layout's markers that were found.
     """
 
-    found: RestCamera
+    fit: RestCamera
     face: str
     markers: int
 
 
-def rest_videos(folder: Path) -> dict[str, Video]:
-    """The videos of a folder, one a camera and named after it; a single video is one camera.
+def open_rest_videos(folder: Path) -> dict[str, Video]:
+    """Open the videos of a folder, by camera. Each file is named after its camera; a single video is one camera.
 
     Raises:
-        InputError: none there, or one that cannot be opened.
+        InputError: there is no video, or one cannot be opened.
     """
     if not folder.exists():
         raise InputError(f"expected videos of the specimen at rest at {folder}, found nothing there; check the path")
@@ -62,97 +62,103 @@ def rest_videos(folder: Path) -> dict[str, Video]:
     return {path.name if path.is_dir() else path.stem: open_video(path) for path in paths}
 
 
-def camera_at_rest(
+def solve_rest_camera(
     name: str, video: Video, layout: MarkerLayout, face: str | None, tilt_sign: int | None, tick: Callable[[], None]
 ) -> RestView:
-    """The camera that filmed a specimen at rest; the specimen's frame is the world.
+    """Calibrate the camera that filmed a specimen at rest; the specimen frame is the world frame.
 
-    The camera stands upright: the picture's up is the specimen's z, or, where it looks along z, its right is x.
+    The camera must stand upright: up in the image is the specimen's z. If it films along z, right in the image is x.
 
     Args:
-        name: of the camera, for messages.
-        video: its.
-        layout: of the specimen's markers.
-        face: one of `FACES`; None to try them all.
+        name: camera name for error messages.
+        video: the camera's video.
+        layout: layout of the specimen's markers.
+        face: one of `FACES`; None to try all.
         tilt_sign: see `rafl.calibration.rest_pose.camera_from_points`.
         tick: called after every frame.
 
     Raises:
-        InputError: dots that move, that match no face, or several alike, or that leave the camera open.
+        InputError: the dots move, match no face, match several faces equally well, or do not determine the camera.
     """
-    dots = _still_dots(video, tick)
-    fits: dict[str, tuple[Array, Array, float]] = {}
+    dots = _rest_positions(video, tick)
+    matches: dict[str, tuple[Array, Array, float]] = {}
     for each in [face] if face else list(FACES):
-        matched = _matched(dots, layout, each, video)
+        matched = _match_face(dots, layout, each, video)
         if matched is not None:
-            fits[each] = matched
-    if not fits:
+            matches[each] = matched
+    if not matches:
         raise InputError(
-            f"{video.path}: expected at least {FEWEST_POINTS} dots in the pattern of the specimen's markers"
+            f"{video.path}: expected at least {MIN_POINTS} dots in the pattern of the specimen's markers"
             f"{f' on its face {face}' if face else ''}, found {len(dots)} dots that do not match; check "
-            "--specimen, and that the camera stands upright"
+            "--specimen, and that the camera is upright"
         )
-    most = max(len(points) for points, _, _ in fits.values())
-    fits = {each: fit for each, fit in fits.items() if len(fit[0]) == most}
-    best = min(misfit for _, _, misfit in fits.values())
-    alike = [each for each, (_, _, misfit) in fits.items() if misfit < ALIKE * best + 1e-3]
-    if len(alike) > 1:
+    most = max(len(points) for points, _, _ in matches.values())
+    matches = {each: match for each, match in matches.items() if len(match[0]) == most}
+    best = min(misfit for _, _, misfit in matches.values())
+    equal = [each for each, (_, _, misfit) in matches.items() if misfit < MISFIT_RATIO * best + 1e-3]
+    if len(equal) > 1:
         raise InputError(
-            f"camera {name}: its dots match the markers of the faces {', '.join(alike)} alike; say which it films, for "
-            f"instance --face {name}={alike[0]}"
+            f"camera {name}: its dots match the faces {', '.join(equal)} equally well; name the face that it films, "
+            f"for instance --face {name}={equal[0]}"
         )
-    points, pixels, _ = fits[alike[0]]
-    found = camera_from_points(points, pixels, video.size, name, tilt_sign)
-    return RestView(found, alike[0], len(points))
+    points, pixels, _ = matches[equal[0]]
+    fit = camera_from_points(points, pixels, video.size, name, tilt_sign)
+    return RestView(fit, equal[0], len(points))
 
 
-def _still_dots(video: Video, tick: Callable[[], None]) -> Array:
-    """The dots' places in the whole video (D, 2)."""
+def _rest_positions(video: Video, tick: Callable[[], None]) -> Array:
+    """Median pixel (D, 2) over the video of each dot that is seen in more than half of the frames."""
     tracks = follow(video, tick)
     seen = np.isfinite(tracks.pixel[..., 0])
     kept = seen.mean(axis=0) > 0.5
-    places = np.array([np.median(tracks.pixel[seen[:, d], d], axis=0) for d in np.flatnonzero(kept)])
-    away = np.nanmax(np.linalg.norm(tracks.pixel[:, kept] - places, axis=2), initial=0.0)
-    if away > AT_REST:
+    positions = np.array([np.median(tracks.pixel[seen[:, d], d], axis=0) for d in np.flatnonzero(kept)])
+    motion = np.nanmax(np.linalg.norm(tracks.pixel[:, kept] - positions, axis=2), initial=0.0)
+    if motion > MAX_MOTION_PX:
         raise InputError(
-            f"{video.path}: expected a specimen at rest, found dots that move by {away:.1f} px; film it unloaded and "
-            "still, or cut the video"
+            f"{video.path}: expected a specimen at rest, found dots that move by {motion:.1f} px; film it unloaded and "
+            "motionless, or cut the video"
         )
-    return places
+    return positions
 
 
-def _matched(dots: Array, layout: MarkerLayout, face: str, video: Video) -> tuple[Array, Array, float] | None:
-    """Markers (P, 3) and their pixels (P, 2) if the camera films this face, and the affine misfit [px]."""
-    away = np.array(FACES[face])
-    right = np.array([1.0, 0.0, 0.0]) if away[2] else np.cross([0.0, 0.0, -1.0], away)
-    rotation = np.stack([right, np.cross(away, right), away])
+def _match_face(dots: Array, layout: MarkerLayout, face: str, video: Video) -> tuple[Array, Array, float] | None:
+    """Match the dots (D, 2) with the markers of one face.
+
+    Returns:
+        Marker positions [m], (P, 3), their pixels (P, 2) and the RMS misfit of an affine map between them [px]; None
+        if the dots do not match this face.
+    """
+    sight = np.array(FACES[face])
+    right = np.array([1.0, 0.0, 0.0]) if sight[2] else np.cross([0.0, 0.0, -1.0], sight)
+    rotation = np.stack([right, np.cross(sight, right), sight])
     camera = OrthographicCamera(
         image_size=video.size, rotation_vector=tuple(Rotation.from_matrix(rotation).as_rotvec()), scale=(1.0, 1.0)
     )
-    places = camera.ideal(layout.positions[visible_markers(layout, camera)])
-    width = np.ptp(places, axis=0)
-    if len(places) < FEWEST_POINTS or len(dots) < FEWEST_POINTS or width.min() < DEEP * width.max():
+    expected = camera.project_undistorted(layout.positions[visible_markers(layout, camera)])
+    extent = np.ptp(expected, axis=0)
+    if len(expected) < MIN_POINTS or len(dots) < MIN_POINTS or extent.min() < MIN_ASPECT * extent.max():
         return None
-    scale = float(_spacing(dots) / _spacing(places))
-    offset = dots.mean(0) - scale * places.mean(0)
+    scale = float(_median_spacing(dots) / _median_spacing(expected))
+    offset = dots.mean(0) - scale * expected.mean(0)
     guess = OrthographicCamera(
         image_size=video.size, rotation_vector=camera.rotation_vector, scale=(scale, scale), offset=tuple(offset)
     )
     try:
-        names = np.array(name_by_layout(dots, layout, guess, str(video.path)))
+        indices = np.array(name_by_layout(dots, layout, guess, str(video.path)))
     except InputError:
         return None
-    named = names >= 0
-    if named.sum() < FEWEST_POINTS:
+    named = indices >= 0
+    if named.sum() < MIN_POINTS:
         return None
-    points, pixels = layout.positions[names[named]], dots[named]
-    design = np.column_stack([guess.ideal(points), np.ones(len(points))])
+    points, pixels = layout.positions[indices[named]], dots[named]
+    design = np.column_stack([guess.project_undistorted(points), np.ones(len(points))])
     affine = np.linalg.lstsq(design, pixels, rcond=None)[0]
-    turn = affine[:2].T / np.sqrt(abs(np.linalg.det(affine[:2])) + 1e-12)
-    if turn[0, 0] + turn[1, 1] < np.sqrt(2.0):  # turned by more than 45 degrees: this camera is not upright
+    linear = affine[:2].T / np.sqrt(abs(np.linalg.det(affine[:2])) + 1e-12)
+    if linear[0, 0] + linear[1, 1] < np.sqrt(2.0):  # rotated by more than 45 degrees: not upright
         return None
     return points, pixels, float(np.sqrt(((design @ affine - pixels) ** 2).mean()))
 
 
-def _spacing(places: Array) -> float:
-    return float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+def _median_spacing(points: Array) -> float:
+    """Median distance of a point to its nearest neighbour."""
+    return float(np.median(cKDTree(points).query(points, 2)[0][:, 1]))

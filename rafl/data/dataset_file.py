@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.common.errors import InputError
-from rafl.common.files import require_file, atomic_file
+from rafl.common.files import atomic_file, require_file
 from rafl.common.version import VERSION
 from rafl.common.yaml_files import check_format
 from rafl.data.dataset import MAX_RELATIVE_TIME_ERROR, Dataset, Trajectory

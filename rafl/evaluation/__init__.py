@@ -1,1 +1,1 @@
-"""Fitted models judged on recordings: error tables, oscillation, reports."""
+"""Evaluation of fitted models on recordings: error tables, oscillation, reports."""

@@ -1,4 +1,4 @@
-"""Pictures of simulated bodies for reports."""
+"""Figures of simulated specimens for reports."""
 
 import base64
 import io
@@ -15,16 +15,17 @@ from rafl.fem.mesh import HexMesh
 Array = NDArray[Any]
 
 
-def png(figure: Figure) -> str:
-    """The figure, closed, as base64 text."""
+def encode_png(figure: Figure) -> str:
+    """Return the figure as a PNG in base64 text, and close it."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=110)
     plt.close(figure)
     return base64.b64encode(buffer.getvalue()).decode()
 
 
-def _axes_3d(figure: Figure, place: int, count: int, q: Array, title: str) -> Any:
-    axes = figure.add_subplot(1, count, place, projection="3d")
+def _add_axes_3d(figure: Figure, index: int, count: int, q: Array, title: str) -> Any:
+    """Add equally scaled axes that hold the positions q (N, 3) [m], as number `index` (from 1) of `count` in a row."""
+    axes = figure.add_subplot(1, count, index, projection="3d")
     low, high = 1e3 * q.min(0), 1e3 * q.max(0)
     middle, half = 0.5 * (low + high), 0.55 * float((high - low).max())
     axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half))
@@ -35,25 +36,37 @@ def _axes_3d(figure: Figure, place: int, count: int, q: Array, title: str) -> An
     return axes
 
 
-def bodies(mesh: HexMesh, frames: list[tuple[str, Array, Array]]) -> str:
-    """Bodies in 3-D with recorded markers as dots; frames of title, positions (N, 3) and markers (M, 3) [m]."""
+def draw_specimens(mesh: HexMesh, frames: list[tuple[str, Array, Array]]) -> str:
+    """Draw the specimen's surface and the recorded markers in 3-D, one plot per frame.
+
+    Args:
+        mesh: of the specimen.
+        frames: title, vertex positions (N, 3) and recorded markers (M, 3) [m] of each.
+
+    Returns:
+        The figure as a PNG in base64 text.
+    """
     figure = plt.figure(figsize=(4.6 * len(frames), 4.2), layout="constrained")
-    every = np.concatenate([q for _, q, _ in frames])
+    all_positions = np.concatenate([q for _, q, _ in frames])
     for k, (title, q, markers) in enumerate(frames):
-        axes = _axes_3d(figure, k + 1, len(frames), every, title)
-        skin = Poly3DCollection(
+        axes = _add_axes_3d(figure, k + 1, len(frames), all_positions, title)
+        surface = Poly3DCollection(
             1e3 * q[mesh.surface], facecolor="#9bc1e3", edgecolor="#3b6f9e", linewidth=0.4, alpha=0.35
         )
-        axes.add_collection3d(skin)
+        axes.add_collection3d(surface)
         axes.scatter(*(1e3 * markers[np.isfinite(markers[:, 0])].T), color="#c0392b", s=6, depthshade=False)
-    return png(figure)
+    return encode_png(figure)
 
 
-def forces(mesh: HexMesh, size: dict[str, Array]) -> str:
-    """Mean residual force at every vertex (N) [N], by method, as colour on the rest shape (the paper's figure)."""
-    figure = plt.figure(figsize=(5.2 * len(size), 4.2), layout="constrained")
-    for k, (method, values) in enumerate(size.items()):
-        axes = _axes_3d(figure, k + 1, len(size), mesh.vertices, method)
+def draw_residual_forces(mesh: HexMesh, magnitude: dict[str, Array]) -> str:
+    """Draw the mean magnitude (N) [N] of the residual force at every vertex, by method, as colour on the rest shape.
+
+    Returns:
+        The figure (as in the paper) as a PNG in base64 text.
+    """
+    figure = plt.figure(figsize=(5.2 * len(magnitude), 4.2), layout="constrained")
+    for k, (method, values) in enumerate(magnitude.items()):
+        axes = _add_axes_3d(figure, k + 1, len(magnitude), mesh.vertices, method)
         dots = axes.scatter(*(1e3 * mesh.vertices.T), c=1e3 * values, cmap="viridis", s=22, depthshade=False)
         figure.colorbar(dots, ax=axes, shrink=0.6, label="mean residual force [mN]")
-    return png(figure)
+    return encode_png(figure)

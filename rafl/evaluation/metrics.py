@@ -1,4 +1,4 @@
-"""The paper's error of original and fitted simulators on recorded shapes."""
+"""Marker errors of the baseline simulator and of fitted models on recordings, as the paper defines them."""
 
 from dataclasses import dataclass
 
@@ -10,28 +10,28 @@ from numpy.typing import NDArray
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import SPLITS, Dataset
 from rafl.data.objective import Recordings, frame_errors
-from rafl.evaluation.oscillation import liveliest, oscillation, resting_error
+from rafl.evaluation.oscillation import fit_oscillation, most_active_coordinate, rest_position_error
 from rafl.fem.mesh import HexMesh
 from rafl.fitting.run_folder import FittedModel
 
-ORIGINAL = "original"
+BASELINE = "original"  # name of the baseline simulator in tables and files
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One recording simulated by every method.
+    """One recording and its simulation by every method.
 
     Attributes:
-        dataset, recording, split: which.
+        dataset, recording, split: names of the dataset, the recording and its split.
         time: [s], (T).
-        recorded: markers [m], (T, M, 3), NaN where not seen.
-        simulated: by method, markers [m], (T, M, 3).
-        errors: by method, mean marker distance of each frame with a marker seen [m], (T').
+        recorded: marker positions [m], (T, M, 3), NaN where not seen.
+        simulated: by method, marker positions [m], (T, M, 3).
+        errors: by method, mean distance of the seen markers [m] in each frame that has any, (T').
         error_time: the times of those frames [s], (T').
         marker_names: (M).
         mesh: of the specimen.
         shapes: by method, vertices in the first and last frame [m], (2, N, 3).
-        force: by method that has a residual force, its mean size at every vertex [N], (N).
+        mean_force: by method that has a residual force, its mean magnitude at every vertex [N], (N).
     """
 
     dataset: str
@@ -45,29 +45,29 @@ class Comparison:
     marker_names: tuple[str, ...]
     mesh: HexMesh
     shapes: dict[str, NDArray[np.float64]]
-    force: dict[str, NDArray[np.float64]]
+    mean_force: dict[str, NDArray[np.float64]]
 
 
 def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison]:
-    """Simulate every recording of a dataset untouched and with each model.
+    """Simulate every recording of a dataset with the baseline simulator and with each model.
 
     Raises:
-        SimulationError: a rollout failed; names recording and step.
-        InputError: a model that does not act on this mesh.
+        SimulationError: a rollout failed; the message names recording and step.
+        InputError: a model is not applicable to this mesh.
     """
     names = list(dataset.trajectories)
     recordings = Recordings.of(dataset, names)
-    simulated, errors, shapes, sizes = {}, {}, {}, {}
+    simulated, errors, shapes, magnitudes = {}, {}, {}, {}
     with torch.no_grad():
-        for method, model in {ORIGINAL: FittedModel(ORIGINAL), **models}.items():
+        for method, model in {BASELINE: FittedModel(BASELINE), **models}.items():
             simulator = model.simulator(dataset.simulator)
-            motion = recordings.in_simulator(simulator).motion
-            q, force = motion(model.residual(simulator), model.parameters(simulator))
+            simulate = recordings.in_simulator(simulator).simulate_vertices
+            q, force = simulate(model.residual(simulator), model.parameters(simulator))
             markers = dataset.markers.positions(q)
             simulated[method] = markers.numpy()
             shapes[method] = q.numpy()
             if force.numel():
-                sizes[method] = torch.linalg.norm(force, dim=-1).numpy()
+                magnitudes[method] = torch.linalg.norm(force, dim=-1).numpy()
             errors[method] = frame_errors(recordings, markers)
     result = []
     for b, name in enumerate(names):
@@ -86,20 +86,23 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
                 dataset.markers.names,
                 dataset.simulator.mesh,
                 {method: q[[0, len(item.time) - 1], b] for method, q in shapes.items()},
-                {method: size[: len(item.time) - 1, b].mean(0) for method, size in sizes.items()},
+                {method: values[: len(item.time) - 1, b].mean(0) for method, values in magnitudes.items()},
             )
         )
     return result
 
 
-def compare_those_that_simulate(
+def compare_skipping_failures(
     dataset: Dataset, models: dict[str, FittedModel]
 ) -> tuple[list[Comparison], dict[str, SimulationError]]:
-    """`compare`, and by model why a simulation with it fails, where one does.
+    """`compare` without the models whose simulation fails.
+
+    Returns:
+        The comparisons, and by name of each model left out the error of its simulation.
 
     Raises:
-        SimulationError: a rollout of the untouched simulator failed.
-        InputError: a model that does not act on this mesh.
+        SimulationError: a rollout of the baseline simulator failed.
+        InputError: a model is not applicable to this mesh.
     """
     try:
         return compare(dataset, models), {}
@@ -114,7 +117,7 @@ def compare_those_that_simulate(
 
 
 def error_table(comparisons: list[Comparison]) -> pd.DataFrame:
-    """A row a recording and method: dataset, recording, split, method, mean_mm, std_mm."""
+    """One row per recording and method, with columns dataset, recording, split, method, mean_mm, std_mm."""
     return pd.DataFrame(
         [
             {
@@ -132,9 +135,9 @@ def error_table(comparisons: list[Comparison]) -> pd.DataFrame:
 
 
 def split_table(comparisons: list[Comparison]) -> pd.DataFrame:
-    """A row a dataset, split and method, over all its recordings and frames.
+    """One row per dataset, split and method, over all recordings and frames of the split.
 
-    +- is the paper's: the standard deviation over all (recording, frame) of the frame's mean.
+    As in the paper, std_mm is the standard deviation over all (recording, frame) of the mean error of the frame.
     """
     rows = []
     datasets = dict.fromkeys(item.dataset for item in comparisons)
@@ -157,24 +160,24 @@ def split_table(comparisons: list[Comparison]) -> pd.DataFrame:
 
 
 def motion_table(comparisons: list[Comparison]) -> pd.DataFrame:
-    """Frequency, damping and final equilibrium of the marker that moves most, recorded and by method.
+    """Oscillation of the most active marker and error of the rest positions, for the recording and every method.
 
     Columns dataset, recording, split, method (`recorded` first), frequency_hz, damping_ratio, final_error_mm.
     """
     rows = []
     for item in comparisons:
-        marker, axis = liveliest(item.recorded)
+        marker, axis = most_active_coordinate(item.recorded)
         for method, markers in {"recorded": item.recorded, **item.simulated}.items():
-            swing = oscillation(item.time, markers[:, marker, axis])
+            fitted = fit_oscillation(item.time, markers[:, marker, axis])
             rows.append(
                 {
                     "dataset": item.dataset,
                     "recording": item.recording,
                     "split": item.split,
                     "method": method,
-                    "frequency_hz": swing.frequency,
-                    "damping_ratio": swing.damping,
-                    "final_error_mm": 1e3 * resting_error(item.recorded, markers),
+                    "frequency_hz": fitted.frequency,
+                    "damping_ratio": fitted.damping,
+                    "final_error_mm": 1e3 * rest_position_error(item.recorded, markers),
                 }
             )
     return pd.DataFrame(rows)
@@ -182,37 +185,37 @@ def motion_table(comparisons: list[Comparison]) -> pd.DataFrame:
 
 @dataclass(frozen=True)
 class Transfer:
-    """Each model on each dataset.
+    """Errors of each model on each dataset.
 
     Attributes:
-        errors: mean errors [mm] of the test recordings (of all, where a dataset has none), a row a method.
-        negative: by fitted method, on how many datasets it is worse than the untouched simulator.
-        tried: by fitted method, on how many datasets it acts.
+        errors: mean errors [mm] of the test recordings (of all, if a dataset has none), one row per method.
+        negative_transfers: by fitted method, the number of datasets on which it is worse than the baseline simulator.
+        datasets_simulated: by fitted method, the number of datasets that it simulates.
     """
 
     errors: pd.DataFrame
-    negative: dict[str, int]
-    tried: dict[str, int]
+    negative_transfers: dict[str, int]
+    datasets_simulated: dict[str, int]
 
     @classmethod
     def of(cls, splits: pd.DataFrame) -> "Transfer":
-        """From `split_table`."""
+        """Collect the errors from a `split_table`."""
         test = splits[splits["split"] == "test"]
-        rest = splits[~splits["dataset"].isin(test["dataset"])]
-        pooled = rest.assign(total=rest["mean_mm"] * rest["recordings"]).groupby(["dataset", "method"], sort=False)
-        others = (pooled["total"].sum() / pooled["recordings"].sum()).rename("mean_mm").reset_index()
-        every = pd.concat([test[["dataset", "method", "mean_mm"]], others]) if len(others) else test
-        errors = every.pivot(index="method", columns="dataset", values="mean_mm")
+        other = splits[~splits["dataset"].isin(test["dataset"])]
+        sums = other.assign(total=other["mean_mm"] * other["recordings"]).groupby(["dataset", "method"], sort=False)
+        pooled = (sums["total"].sum() / sums["recordings"].sum()).rename("mean_mm").reset_index()
+        means = pd.concat([test[["dataset", "method", "mean_mm"]], pooled]) if len(pooled) else test
+        errors = means.pivot(index="method", columns="dataset", values="mean_mm")
         errors = errors.loc[list(dict.fromkeys(splits["method"])), list(dict.fromkeys(splits["dataset"]))]
-        fitted = errors.drop(index=ORIGINAL)
-        worse = fitted.gt(errors.loc[ORIGINAL], axis="columns").sum(axis=1)
-        tried = fitted.notna().sum(axis=1)
-        negative, acting = ({str(method): int(n) for method, n in counts.items()} for counts in (worse, tried))
-        return cls(errors, negative, acting)
+        fitted = errors.drop(index=BASELINE)
+        worse = fitted.gt(errors.loc[BASELINE], axis="columns").sum(axis=1)
+        simulated = fitted.notna().sum(axis=1)
+        negative, applied = ({str(method): int(n) for method, n in counts.items()} for counts in (worse, simulated))
+        return cls(errors, negative, applied)
 
 
 def latex_table(splits: pd.DataFrame) -> str:
-    """The test errors as a LaTeX tabular: better than the original underlined, the best of a row bold."""
+    """The test errors as a LaTeX tabular. Underlined: better than the baseline simulator. Bold: best of the row."""
     test = splits[splits["split"] == "test"]
     test = test if len(test) else splits
     methods = list(dict.fromkeys(test["method"]))
@@ -227,14 +230,17 @@ def latex_table(splits: pd.DataFrame) -> str:
                 continue
             cell = rf"{means[method]:.3f} \pm {stds[method]:.3f}"
             cell = rf"\mathbf{{{cell}}}" if means[method] == min(means.values()) else cell
-            cell = rf"\underline{{{cell}}}" if means[method] < means[ORIGINAL] else cell
+            cell = rf"\underline{{{cell}}}" if means[method] < means[BASELINE] else cell
             cells.append(f"${cell}$")
         lines.append(f"{dataset} & " + " & ".join(cells) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
 def held_out_errors(comparisons: list[Comparison]) -> dict[str, float]:
-    """Mean error [m] over the test recordings of all datasets, by method that acts on them all; empty without any."""
+    """Mean error [m] over the test recordings of all datasets, by method that simulates them all.
+
+    Empty if no recording has split `test`.
+    """
     chosen = [item for item in comparisons if item.split == "test"]
     methods = dict.fromkeys(method for item in chosen for method in item.errors)
     return {

@@ -1,4 +1,4 @@
-"""The project's commands as a lab types them."""
+"""Run the project's command-line tools."""
 
 import os
 import subprocess
@@ -6,7 +6,11 @@ import sys
 from pathlib import Path
 
 
-def command(name: str, *arguments: object) -> None:
-    """Run one of this environment's commands; its failure ends the program."""
+def run_command(name: str, *arguments: object) -> None:
+    """Run a command of this environment with one BLAS thread.
+
+    Raises:
+        CalledProcessError: the command failed.
+    """
     line = [str(Path(sys.executable).parent / name), *map(str, arguments)]
     subprocess.run(line, check=True, env={**os.environ, "OPENBLAS_NUM_THREADS": "1"})

@@ -1,8 +1,8 @@
-"""The first frame of the canonical beam: the direct fit beside the sequence of forces of earlier work, in one run.
+"""Fit of the first frame of the canonical beam: the direct fit compared with the sequence of forces of earlier work.
 
     python tests/bench/first_frame.py [--iterations 300]
 
-Markers of the beam under a weight, with noise of 5 micrometres.
+The markers are those of the beam under a load at the tip, with noise of 5 micrometres.
 """
 
 import argparse
@@ -11,45 +11,53 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from rafl.capture.registration.initial import FirstFrame, fit_first_frame
-from rafl.capture.registration.sequence import ITERATIONS, fit_by_sequence
-from rafl.capture.specimen.specimen import read_specimen
 from rich.console import Console
 from rich.table import Table
 
-from rafl.data.synthetic import hung
+from rafl.capture.registration.initial import FirstFrame, fit_first_frame
+from rafl.capture.registration.sequence import ITERATIONS, fit_by_sequence
+from rafl.capture.specimen.specimen import read_specimen
+from rafl.data.synthetic import loaded_equilibria
 
 CANONICAL = Path(__file__).parents[2] / "datasets" / "specimens" / "canonical.yaml"
-SIGMA = 5e-6
-LOADS = (0.05, 0.12, 0.22)  # kg
+NOISE_SIGMA = 5e-6  # of the markers [m]
+LOADS_KG = (0.05, 0.12, 0.22)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--iterations", type=int, default=ITERATIONS, help="of the sequence's optimiser")
+    parser.add_argument("--iterations", type=int, default=ITERATIONS, help="Adam iterations of the sequence of forces")
     options = parser.parse_args()
     torch.set_num_threads(1)
     specimen, random = read_specimen(CANONICAL), np.random.default_rng(0)
     simulator, markers = specimen.simulator(0.01), specimen.markers(1e-6)
-    table = Table("load [g]", "way", "seconds", "markers / sigma", "worst vertex [mm]", title="first frame")
+    table = Table(
+        "load [g]",
+        "method",
+        "time [s]",
+        "marker residual / sigma",
+        "largest vertex error [mm]",
+        title="fit of the first frame",
+    )
     seconds: dict[str, list[float]] = {"direct": [], "sequence": []}
-    for number, load in enumerate((LOADS[0], *LOADS)):  # the first is to compile the kernels
-        truth = hung(simulator, specimen.loaded, np.array([load]))[0]
+    for number, load in enumerate((LOADS_KG[0], *LOADS_KG)):  # the first round compiles the kernels
+        truth = loaded_equilibria(simulator, specimen.loaded, np.array([load]))[0]
         exact = markers.positions(torch.from_numpy(truth)).numpy()
-        sigma = np.full_like(exact, SIGMA)
-        frame = FirstFrame(simulator, markers, specimen.loaded, exact + random.normal(0, SIGMA, exact.shape), sigma, "")
-        ways = {"direct": fit_first_frame, "sequence": lambda it: fit_by_sequence(it, options.iterations)}
-        for way, fit in ways.items():
-            if way == "sequence" and number != 1:
+        sigma = np.full_like(exact, NOISE_SIGMA)
+        observed = exact + random.normal(0, NOISE_SIGMA, exact.shape)
+        frame = FirstFrame(simulator, markers, specimen.loaded, observed, sigma, "")
+        methods = {"direct": fit_first_frame, "sequence": lambda frame: fit_by_sequence(frame, options.iterations)}
+        for method, fit in methods.items():
+            if method == "sequence" and number != 1:
                 continue  # takes minutes: one load is enough
-            begun = time.perf_counter()
-            found = fit(frame)
-            took = time.perf_counter() - begun
+            start = time.perf_counter()
+            state = fit(frame)
+            duration = time.perf_counter() - start
             if number > 0:
-                seconds[way].append(took)
-                off = 1e3 * np.linalg.norm(found.q - truth, axis=1).max()
-                size = found.residual / np.sqrt(3.0) / SIGMA
-                table.add_row(f"{1e3 * load:.0f}", way, f"{took:.2f}", f"{size:.2f}", f"{off:.3f}")
+                seconds[method].append(duration)
+                vertex_error = 1e3 * np.linalg.norm(state.q - truth, axis=1).max()
+                relative = state.residual / np.sqrt(3.0) / NOISE_SIGMA
+                table.add_row(f"{1e3 * load:.0f}", method, f"{duration:.2f}", f"{relative:.2f}", f"{vertex_error:.3f}")
     Console(width=100).print(table)
     ratio = np.mean(seconds["sequence"]) / np.mean(seconds["direct"])
     print(f"the direct fit is {ratio:.0f} times as fast")

@@ -1,4 +1,4 @@
-"""How near the dots' measured places are to the true ones, beside the Cramer-Rao bound and other detectors."""
+"""Tracking benchmark: accuracy of detected dots, compared with the Cramer-Rao bound and other detectors."""
 
 import tempfile
 from collections.abc import Iterator
@@ -8,24 +8,39 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trackpy
-from footage import Row, write_video
-from rafl.tracking.detection.appearance import find_family
+from footage import Measurement, write_video
+from scipy.optimize import linear_sum_assignment
+
+from rafl.tracking.detection.appearance import find_markers
 from rafl.tracking.detection.detect import Dots
 from rafl.tracking.linking.follow import follow
 from rafl.tracking.synthetic import Scene, draw, expose
 from rafl.tracking.video.reader import open_video
-from scipy.optimize import linear_sum_assignment
+
+MAX_MATCH_DISTANCE = 3.0  # between a detection and its dot [px]
+MIN_COUNTED_ERROR = 0.25  # smallest error that counts as too large for its sigma [px]
+TOO_LARGE = f"errors > {MIN_COUNTED_ERROR} px and > 4 sigma"
 
 
 @dataclass(frozen=True)
 class Case:
-    """One kind of picture: the scene, and how its dots are."""
+    """One kind of image.
+
+    Attributes:
+        name: in the results.
+        scene: appearance of the dots and their surroundings.
+        radius: of the dots [px].
+        exposure: fraction of the time between two frames.
+        axis_ratio: short over long semi-axis of the dots.
+        hard: whether the image has disturbances; the target is then a looser one, for the median error.
+        codec: `h264` for a compressed video; empty for single images.
+    """
 
     name: str
     scene: Scene
     radius: float
     exposure: float = 0.2
-    ratio: float = 1.0
+    axis_ratio: float = 1.0
     hard: bool = False
     codec: str = ""
 
@@ -33,169 +48,183 @@ class Case:
 def cases() -> Iterator[Case]:
     for radius in (6.0, 8.0, 12.0):
         for noise in (2.0, 4.0, 8.0):
-            yield Case(f"R {radius:.0f}, noise {noise:.0f}", Scene(noise=noise, slope=0.25), radius)
-    plain = Scene(noise=4.0, slope=0.25)
+            yield Case(f"radius {radius:.0f} px, noise {noise:.0f}", Scene(noise=noise, light_falloff=0.25), radius)
+    plain = Scene(noise=4.0, light_falloff=0.25)
     yield Case("60 % exposure", plain, 8.0, exposure=0.6, hard=True)
     yield Case("defocus 2.5 px", replace(plain, blur=2.5), 8.0, hard=True)
-    yield Case("ellipses 0.7", plain, 8.0, ratio=0.7, hard=True)
-    yield Case("glare", replace(plain, glare=0.5), 8.0, hard=True)
-    yield Case("glare on grey skin", replace(plain, skin=100.0, glare=0.5), 8.0, hard=True)
+    yield Case("ellipses, axis ratio 0.7", plain, 8.0, axis_ratio=0.7, hard=True)
+    yield Case("specular highlights", replace(plain, highlight_fraction=0.5), 8.0, hard=True)
+    yield Case("highlights on grey skin", replace(plain, skin=100.0, highlight_fraction=0.5), 8.0, hard=True)
     box = (90.0, 80.0, 1190.0, 640.0)
-    yield Case("beam's edge", replace(plain, skin_box=box), 8.0, hard=True)
-    yield Case("clutter", replace(plain, skin_box=box, clutter=30.0), 8.0, hard=True)
+    yield Case("edge of the beam", replace(plain, skin_box=box), 8.0, hard=True)
+    yield Case("cluttered background", replace(plain, skin_box=box, clutter=30.0), 8.0, hard=True)
     yield Case("H.264 crf 23", replace(plain, noise=3.0), 8.0, hard=True, codec="h264")
 
 
-def scattered(case: Case, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """Ellipses (D, 5) in loose rows, and their smears (D, 2) from up to 12 px a frame."""
-    pitch = 6.0 * case.radius
-    x, y = np.meshgrid(np.arange(130, 1150, pitch), np.arange(120, 600, pitch))
-    if case.name == "beam's edge":  # the outermost rows so near the edge that it cuts the dots' surroundings
+def random_dots(case: Case, random: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Ellipses (D, 5) in irregular rows, and their motions during the exposure (D, 2), from up to 12 px a frame."""
+    spacing = 6.0 * case.radius
+    x, y = np.meshgrid(np.arange(130, 1150, spacing), np.arange(120, 600, spacing))
+    if case.name == "edge of the beam":  # the edge crosses the surroundings of the dots in the outermost rows
         y[0], y[-1] = 80.0 + 1.35 * case.radius, 640.0 - 1.35 * case.radius
     centres = np.stack([x.ravel(), y.ravel()], axis=1)
     jitter = random.uniform(-3, 3, centres.shape)
-    if case.name == "beam's edge":
+    if case.name == "edge of the beam":
         jitter = random.uniform(-0.5, 0.5, centres.shape)
     centres += jitter
     angle = random.uniform(0, np.pi, len(centres))
-    ellipses = np.column_stack(
-        [centres, np.full(len(centres), case.radius), np.full(len(centres), case.ratio * case.radius), angle]
-    )
-    way = random.uniform(0, 2 * np.pi, len(centres))
+    long_axis = np.full(len(centres), case.radius)
+    short_axis = np.full(len(centres), case.axis_ratio * case.radius)
+    ellipses = np.column_stack([centres, long_axis, short_axis, angle])
+    direction = random.uniform(0, 2 * np.pi, len(centres))
     speed = random.uniform(0, 12.0, len(centres))
-    smear = case.exposure * speed[:, None] * np.stack([np.cos(way), np.sin(way)], axis=1)
-    return ellipses, smear
+    motion = case.exposure * speed[:, None] * np.stack([np.cos(direction), np.sin(direction)], axis=1)
+    return ellipses, motion
 
 
-def bound(case: Case, ellipse: np.ndarray, smear: np.ndarray, light: float) -> np.ndarray:
-    """The Cramer-Rao bound of one dot's place where all else is known, along x and y [px]."""
-    side = int(2 * (case.radius + 8) + np.abs(smear).max())
-    scene = replace(case.scene, size=(side, side), slope=0.0, skin_box=None, glare=0.0, fine=4)
-    own = np.array([0.5 * side, 0.5 * side, *ellipse[2:]])
+def cramer_rao_bound(case: Case, ellipse: np.ndarray, motion: np.ndarray, light: float) -> np.ndarray:
+    """The Cramer-Rao bound of a dot's position if all else is known, along x and y [px]."""
+    side = int(2 * (case.radius + 8) + np.abs(motion).max())
+    scene = replace(
+        case.scene, size=(side, side), light_falloff=0.0, skin_box=None, highlight_fraction=0.0, supersampling=4
+    )
+    centred = np.array([0.5 * side, 0.5 * side, *ellipse[2:]])
     h = 0.05
     result = np.empty(2)
     for axis in range(2):
-        moved = [own.copy(), own.copy()]
-        for sign, item in zip((1, -1), moved, strict=True):
+        shifted = [centred.copy(), centred.copy()]
+        for sign, item in zip((1, -1), shifted, strict=True):
             item[axis] += sign * h
-        up, down = (draw(scene, item[None], np.random.default_rng(0), smear[None]) for item in moved)
-        slope = light * (up - down) / (2 * h)
+        plus, minus = (draw(scene, item[None], np.random.default_rng(0), motion[None]) for item in shifted)
+        slope = light * (plus - minus) / (2 * h)
         result[axis] = np.sqrt(case.scene.noise**2 + 1.0 / 12.0) / np.sqrt((slope**2).sum())
     return result
 
 
-def matched(found: np.ndarray, truth: np.ndarray, near: float) -> tuple[np.ndarray, np.ndarray]:
+def match_positions(found: np.ndarray, truth: np.ndarray, max_distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the matched pairs in `found` (F, 2) and `truth` (D, 2)."""
     if not len(found):
         return np.zeros(0, int), np.zeros(0, int)
     distance = np.linalg.norm(found[:, None] - truth[None], axis=2)
-    row, column = linear_sum_assignment(np.minimum(distance, near))
-    good = distance[row, column] < near
+    row, column = linear_sum_assignment(np.minimum(distance, max_distance))
+    good = distance[row, column] < max_distance
     return row[good], column[good]
 
 
-def blob_detector(picture: np.ndarray, radius: float) -> np.ndarray:
+def position_errors(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
+    """Errors of the matched positions [px], (P, 2)."""
+    row, column = match_positions(found, truth, MAX_MATCH_DISTANCE)
+    return found[row] - truth[column]
+
+
+def detect_with_trackpy(image: np.ndarray, radius: float) -> np.ndarray:
+    diameter = int(2 * radius) | 1
+    return trackpy.locate(image, diameter + 4, invert=True, minmass=20 * radius**2)[["x", "y"]].to_numpy()
+
+
+def detect_with_opencv(image: np.ndarray, radius: float) -> np.ndarray:
     settings = cv2.SimpleBlobDetector_Params()
     settings.minArea, settings.maxArea = float(radius**2), float(8 * radius**2)
     settings.filterByColor, settings.blobColor = True, 0
-    found = cv2.SimpleBlobDetector_create(settings).detect(picture)
+    found = cv2.SimpleBlobDetector_create(settings).detect(image)
     return np.array([point.pt for point in found]).reshape(-1, 2)
 
 
-def localisation(random: np.random.Generator, quick: bool) -> Iterator[Row]:
+def root_mean_square(errors: list[np.ndarray]) -> float:
+    return float(np.sqrt((np.concatenate(errors) ** 2).mean()))
+
+
+def measure_localisation(random: np.random.Generator, quick: bool) -> Iterator[Measurement]:
     for case in cases():
         if case.codec:
-            yield from compression(case, random, quick)
+            yield from measure_compression(case, random, quick)
             continue
-        errors, sigmas, bounds, theirs, blobs = [], [], [], [], []
-        false = total = 0
-        pictures, truths = [], []
+        errors, sigmas, bounds, trackpy_errors, opencv_errors = [], [], [], [], []
+        false_detections = missed = 0
+        images, truths = [], []
         for _ in range(1 if quick else 8):
-            ellipses, smear = scattered(case, random)
-            clean = draw(case.scene, ellipses, random, smear)
-            pictures.append(expose(clean, case.scene, random))
-            truths.append((ellipses, smear))
-        for picture, (ellipses, smear) in zip(pictures, truths, strict=True):
-            found = find_family(picture)
-            dots = found[1] if found is not None else Dots.none(0)
-            row, column = matched(dots.centre, ellipses[:, :2], 3.0)
-            errors.append(dots.centre[row] - ellipses[column, :2])
+            ellipses, motion = random_dots(case, random)
+            clean = draw(case.scene, ellipses, random, motion)
+            images.append(expose(clean, case.scene, random))
+            truths.append((ellipses, motion))
+        for image, (ellipses, motion) in zip(images, truths, strict=True):
+            found = find_markers(image)
+            dots = found[1] if found is not None else Dots.missing(0)
+            centres = ellipses[:, :2]
+            row, column = match_positions(dots.centre, centres, MAX_MATCH_DISTANCE)
+            errors.append(dots.centre[row] - centres[column])
             sigmas.append(dots.sigma[row])
-            false += len(dots) - len(row)
-            total += len(ellipses) - len(row)
-            skin = 1.0 - case.scene.slope * (
-                0.6 * ellipses[:, 0] / case.scene.size[0] + 0.4 * (ellipses[:, 1] / case.scene.size[1]) ** 2
-            )
-            bounds.append(np.array([bound(case, ellipses[k], smear[k], skin[k]) for k in column]))
-            diameter = int(2 * case.radius) | 1
-            table = trackpy.locate(picture, diameter + 4, invert=True, minmass=20 * case.radius**2)
-            other = table[["x", "y"]].to_numpy()
-            a, b = matched(other, ellipses[:, :2], 3.0)
-            theirs.append(other[a] - ellipses[b, :2])
-            other = blob_detector(picture, case.radius)
-            a, b = matched(other, ellipses[:, :2], 3.0)
-            blobs.append(other[a] - ellipses[b, :2])
-        error, sigma = np.concatenate(errors), np.concatenate(sigmas)
+            false_detections += len(dots) - len(row)
+            missed += len(ellipses) - len(row)
+            (x, y), (width, height) = centres.T, case.scene.size
+            light = 1.0 - case.scene.light_falloff * (0.6 * x / width + 0.4 * (y / height) ** 2)
+            bounds.append(np.array([cramer_rao_bound(case, ellipses[k], motion[k], light[k]) for k in column]))
+            trackpy_errors.append(position_errors(detect_with_trackpy(image, case.radius), centres))
+            opencv_errors.append(position_errors(detect_with_opencv(image, case.radius), centres))
+        error, sigma, bound = np.concatenate(errors), np.concatenate(sigmas), np.concatenate(bounds)
         rms = float(np.sqrt((error**2).mean()))
-        yield Row("RMS error [px]", case.name, rms)
-        yield Row("  trackpy", case.name, float(np.sqrt((np.concatenate(theirs) ** 2).mean())))
-        yield Row("  SimpleBlobDetector", case.name, float(np.sqrt((np.concatenate(blobs) ** 2).mean())))
+        yield Measurement("RMS error [px]", case.name, rms)
+        yield Measurement("  trackpy", case.name, root_mean_square(trackpy_errors))
+        yield Measurement("  OpenCV SimpleBlobDetector", case.name, root_mean_square(opencv_errors))
         if case.hard:
-            lower = np.concatenate(bounds)
-            share = np.linalg.norm(error, axis=1) / np.linalg.norm(lower, axis=1)
-            # The median of a two-dimensional error's length is 1.177 standard deviations of a coordinate.
-            yield Row("median error / bound", case.name, float(np.median(share)) * np.sqrt(2) / 1.1774, "<= 1.4")
+            ratio = float(np.median(np.linalg.norm(error, axis=1) / np.linalg.norm(bound, axis=1)))
+            # The median length of a two-dimensional error is 1.177 standard deviations of a coordinate.
+            yield Measurement("median error / Cramer-Rao bound", case.name, ratio * np.sqrt(2) / 1.1774, "<= 1.4")
         else:
-            lower = np.concatenate(bounds)
-            yield Row("RMS / Cramer-Rao", case.name, rms / float(np.sqrt((lower**2).mean())), "<= 1.15")
-        yield Row("within one sigma [%]", case.name, 100 * float((np.abs(error) < sigma).mean()), "64 to 72")
-        silent = (np.abs(error) > 0.25) & (np.abs(error) > 4 * sigma)
-        yield Row("off by > 0.25 px in silence", case.name, int(silent.sum()), "0")
-        yield Row("false markers", case.name, false, "0")
-        yield Row("missed dots", case.name, total)
+            ratio = rms / float(np.sqrt((bound**2).mean()))
+            yield Measurement("RMS error / Cramer-Rao bound", case.name, ratio, "<= 1.15")
+        covered = 100 * float((np.abs(error) < sigma).mean())
+        yield Measurement("errors within one sigma [%]", case.name, covered, "64 to 72")
+        yield Measurement(TOO_LARGE, case.name, count_too_large(error, sigma), "0")
+        yield Measurement("false detections", case.name, false_detections, "0")
+        yield Measurement("missed dots", case.name, missed)
 
 
-def compression(case: Case, random: np.random.Generator, quick: bool) -> Iterator[Row]:
-    """Videos of 105 dots that swing together, up to 1 or up to 27 px a frame, compressed and followed.
+def count_too_large(error: np.ndarray, sigma: np.ndarray) -> int:
+    return int(((np.abs(error) > MIN_COUNTED_ERROR) & (np.abs(error) > 4 * sigma)).sum())
 
-    By an encoder that searches well, which is what is asked for, and by one that is in a hurry. All dots of a video
-    share much of their errors, so one alone says little of how many are covered.
+
+def measure_compression(case: Case, random: np.random.Generator, quick: bool) -> Iterator[Measurement]:
+    """Errors in compressed videos of 105 dots that oscillate in phase, by at most 1 or at most 27 px a frame.
+
+    Each video is encoded with the preset `medium`, which the targets are meant for, and with `veryfast`. The errors of
+    the dots in one video are correlated, so that the fraction within one sigma varies from video to video.
     """
-    films = 1 if quick else 4
+    videos = 1 if quick else 4
     for preset in ("medium", "veryfast"):
-        for speed, swing in (("slow", 2.2), ("fast", 60.0)):
+        for speed, amplitude in (("slow", 2.2), ("fast", 60.0)):
             name = f"{case.name}, {preset}, {speed}"
-            filmed = [compressed(case, preset, swing, 48 if quick else 120, random) for _ in range(films)]
-            error, sigma = (np.stack(values) for values in zip(*filmed, strict=True))
+            results = [track_compressed(case, preset, amplitude, 48 if quick else 120, random) for _ in range(videos)]
+            error, sigma = (np.stack(values) for values in zip(*results, strict=True))
             rms, reported = (float(np.sqrt(np.nanmean(values**2))) for values in (error, sigma))
-            yield Row("RMS error [px]", name, rms, "<= 0.055")
-            yield Row("reported sigma / RMS error", name, reported / rms, "0.75 to 1.25")
+            yield Measurement("RMS error [px]", name, rms, "<= 0.055")
+            yield Measurement("reported sigma / RMS error", name, reported / rms, "0.75 to 1.25")
             covered = 100 * (np.abs(error) < sigma).mean(axis=(1, 2, 3))
-            yield Row("within one sigma [%]", name, float(covered.mean()), "64 to 72")
-            yield Row("  least in a video", name, float(covered.min()))
-            yield Row("  most in a video", name, float(covered.max()))
-            silent = (np.abs(error) > 0.25) & (np.abs(error) > 4 * sigma)
-            yield Row("off by > 0.25 px in silence", name, int(silent.sum()), "0")
+            yield Measurement("errors within one sigma [%]", name, float(covered.mean()), "64 to 72")
+            yield Measurement("  smallest in a video", name, float(covered.min()))
+            yield Measurement("  largest in a video", name, float(covered.max()))
+            yield Measurement(TOO_LARGE, name, count_too_large(error, sigma), "0")
 
 
-def compressed(
-    case: Case, preset: str, swing: float, frames: int, random: np.random.Generator
+def track_compressed(
+    case: Case, preset: str, amplitude: float, frames: int, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Errors and sigma of the dots of a compressed video [px], (T, D, 2) each."""
-    ellipses, _ = scattered(replace(case, radius=1.5 * case.radius), random)
+    """Errors and sigma of the dots in a compressed video [px], (T, D, 2) each."""
+    ellipses, _ = random_dots(replace(case, radius=1.5 * case.radius), random)
     ellipses[:, 2:4] = case.radius
-    amount = swing * (ellipses[:, 0] / 1280.0) ** 2
+    amplitudes = amplitude * (ellipses[:, 0] / 1280.0) ** 2
     phase = random.uniform(0, 6) + 0.45 * np.arange(frames)
     truth = np.repeat(ellipses[None, :, :2], frames, axis=0)
-    truth[..., 1] += 30.0 + amount * np.sin(phase)[:, None]
-    pictures = []
+    truth[..., 1] += 30.0 + amplitudes * np.sin(phase)[:, None]
+    images = []
     for t in range(frames):
-        smear = np.zeros((len(ellipses), 2))
-        smear[:, 1] = case.exposure * amount * 0.45 * np.cos(phase[t])
-        here = np.column_stack([truth[t], ellipses[:, 2:]])
-        pictures.append(expose(draw(replace(case.scene, fine=4), here, random, smear), case.scene, random))
+        motion = np.zeros((len(ellipses), 2))
+        motion[:, 1] = case.exposure * amplitudes * 0.45 * np.cos(phase[t])
+        moved = np.column_stack([truth[t], ellipses[:, 2:]])
+        images.append(expose(draw(replace(case.scene, supersampling=4), moved, random, motion), case.scene, random))
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.mp4"
-        write_video(path, pictures, "h264", {"crf": "23", "preset": preset})
+        write_video(path, images, "h264", {"crf": "23", "preset": preset})
         tracks = follow(open_video(path), lambda: None)
     order = np.linalg.norm(truth[0][:, None] - tracks.start[None], axis=2).argmin(axis=1)
     return tracks.pixel[:, order] - truth, tracks.sigma[:, order]

@@ -1,4 +1,4 @@
-"""The benches take hours; that they still fit what they measure is seen by loading them."""
+"""The benchmarks take hours; importing them shows that they match the interfaces that they measure."""
 
 import importlib.util
 import sys
@@ -11,7 +11,7 @@ SCRIPTS = [path for path in sorted(TESTS.glob("bench/*.py")) if path != Path(__f
 
 
 @pytest.mark.parametrize("path", [*SCRIPTS, TESTS / "reference" / "check.py"], ids=lambda path: path.stem)
-def test_a_bench_loads(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_benchmark_can_be_imported(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(path.parent))
     name = f"bench_{path.stem}"
     spec = importlib.util.spec_from_file_location(name, path)

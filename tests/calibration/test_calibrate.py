@@ -1,4 +1,4 @@
-"""`rafl-calibrate` on pictures."""
+"""The command `rafl-calibrate` on rendered board images."""
 
 import re
 from pathlib import Path
@@ -7,26 +7,27 @@ import cv2
 import numpy as np
 import pytest
 import yaml
-from rafl.calibration.rig import read_rig
 from scipy.spatial.transform import Rotation
 from support import Run, assert_refused
+
+from rafl.calibration.rig import read_rig
 
 SCALE = 9.0  # px/mm
 
 
-def board_picture(tilt: np.ndarray, kind: str = "dots", supersampling: int = 4) -> np.ndarray:
-    """9 x 6 dots of 5 mm at 10 mm, or a chessboard with as many inner corners, turned, seen from the front."""
-    turned = SCALE * Rotation.from_rotvec(tilt).as_matrix()[:2, :2]
+def board_image(tilt: np.ndarray, kind: str = "dots", supersampling: int = 4) -> np.ndarray:
+    """A tilted board: 9 x 6 dots of 5 mm, 10 mm apart, or a chessboard with as many inner corners."""
+    to_pixels = SCALE * Rotation.from_rotvec(tilt).as_matrix()[:2, :2]
     size = (900, 640)
     u, v = np.meshgrid(*(np.arange(n * supersampling) / supersampling - 0.5 + 0.5 / supersampling for n in size))
-    board = np.stack([u - 100.0, v - 90.0], axis=-1) @ np.linalg.inv(turned).T
+    board = np.stack([u - 100.0, v - 90.0], axis=-1) @ np.linalg.inv(to_pixels).T
     nearest = np.clip(np.rint(board / 10.0), 0, [8, 5]) * 10.0
     dark = np.linalg.norm(board - nearest, axis=-1) < 2.5
     if kind == "squares":
         inside = ((board > -10) & (board < [90, 60])).all(axis=-1)
         dark = inside & (np.floor(board / 10.0).astype(int).sum(axis=-1) % 2 == 0)
-    picture = np.where(dark, 30.0, 210.0)
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    image = np.where(dark, 30.0, 210.0)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
 
 
 TILTS = [[0, 0, 0], [0.4, 0, 0], [0, 0.45, 0], [0.3, 0.3, 0], [-0.3, 0.35, 0.05], [0.2, -0.4, 0], [-0.5, 0.1, 0]]
@@ -37,30 +38,30 @@ def dot_grid(tmp_path: Path) -> Path:
     folder = tmp_path / "grid"
     folder.mkdir()
     for number, tilt in enumerate(TILTS):
-        cv2.imwrite(str(folder / f"{number}.png"), board_picture(np.array(tilt)))
+        cv2.imwrite(str(folder / f"{number}.png"), board_image(np.array(tilt)))
     (folder / "board.yaml").write_text(
         "format: rafl-board/1\npattern: {kind: dot-grid, dots: [9, 6], spacing_mm: 10}\n"
     )
     return folder
 
 
-def test_a_dot_grid_before_one_camera(dot_grid: Path, run: Run, tmp_path: Path) -> None:
+def test_dot_grid_calibrates_one_camera(dot_grid: Path, run: Run, tmp_path: Path) -> None:
     result = run("rafl-calibrate", dot_grid, "--out", "calib.yaml")
     assert result.returncode == 0, result.stderr
     assert "next: rafl-track" in result.stdout
     (camera,) = read_rig(tmp_path / "calib.yaml").cameras.values()
     assert camera.scale == pytest.approx((9000.0, 9000.0), rel=1e-3)
     assert camera.residual < 0.1
-    # The first picture's board is the world: its first dot is the origin, at pixel (100, 90).
+    # The board in the first image is the world frame: its first dot is the origin, at pixel (100, 90).
     assert camera.offset == pytest.approx((100.0, 90.0), abs=0.1)
 
 
-def test_a_chessboard_and_held_out_pictures(run: Run, tmp_path: Path) -> None:
-    """Solved from seven pictures, checked on two others; a calibration that does not fit shows in the check."""
+def test_chessboard_calibration_is_checked_on_other_images(run: Run, tmp_path: Path) -> None:
+    """A calibration from seven images fits two others; one with a wrong skew has at least twice the residual."""
     for folder, tilts in (("made", TILTS), ("held", [[0.25, 0.2, 0.03], [-0.2, 0.3, 0.0]])):
         (tmp_path / folder).mkdir()
         for number, tilt in enumerate(tilts):
-            cv2.imwrite(str(tmp_path / folder / f"{number}.png"), board_picture(np.array(tilt), "squares"))
+            cv2.imwrite(str(tmp_path / folder / f"{number}.png"), board_image(np.array(tilt), "squares"))
         (tmp_path / folder / "board.yaml").write_text(
             "format: rafl-board/1\npattern: {kind: chessboard, corners: [9, 6], square_mm: 10}\n"
         )
@@ -73,16 +74,16 @@ def test_a_chessboard_and_held_out_pictures(run: Run, tmp_path: Path) -> None:
     result = run("rafl-calibrate", "held", "--check", "calib.yaml")
     assert result.returncode == 0, result.stderr
     assert (tmp_path / "check-held.png").stat().st_size > 5000
-    good = [float(line.split("│")[4]) for line in result.stdout.splitlines() if "held/" in line]
-    assert max(good) < 0.2
+    residuals = [float(line.split("│")[4]) for line in result.stdout.splitlines() if "held/" in line]
+    assert max(residuals) < 0.2
     wrong = re.sub(r"skew: .*", "skew: 0.3", text.replace("made:", "held:"))
     (tmp_path / "calib.yaml").write_text(wrong)
     result = run("rafl-calibrate", "held", "--check", "calib.yaml")
-    worse = [float(line.split("│")[4]) for line in result.stdout.splitlines() if "held/" in line]
-    assert min(worse) > 2 * max(good)
+    wrong_residuals = [float(line.split("│")[4]) for line in result.stdout.splitlines() if "held/" in line]
+    assert min(wrong_residuals) > 2 * max(residuals)
 
 
-def test_bad_input(dot_grid: Path, run: Run, tmp_path: Path) -> None:
+def test_bad_input_is_refused(dot_grid: Path, run: Run, tmp_path: Path) -> None:
     board = (dot_grid / "board.yaml").read_text()
 
     def refused(*parts: str) -> None:
@@ -95,16 +96,16 @@ def test_bad_input(dot_grid: Path, run: Run, tmp_path: Path) -> None:
     (dot_grid / "board.yaml").write_text(board.replace("dot-grid", "circles"))
     refused("pattern", "circles")
     (dot_grid / "board.yaml").write_text(board.replace("[9, 6]", "[12, 8]"))
-    refused("camera grid", "at least 4 pictures")
+    refused("camera grid", "at least 4 images")
     world = {"grid/9.png": {"origin_mm": [0, 0, 0], "x_axis": [1, 0, 0], "y_axis": [0, 1, 0]}}
     (dot_grid / "board.yaml").write_text(board + yaml.safe_dump({"world": world}))
-    refused("grid/9.png", "not among the pictures")
+    refused("grid/9.png", "not among the images")
     (dot_grid / "board.yaml").write_text(board)
-    (dot_grid / "3.png").write_bytes(b"not a picture")
+    (dot_grid / "3.png").write_bytes(b"not an image")
     refused("3.png", "cannot be read")
     huge = bytearray(cv2.imencode(".bmp", np.zeros((8, 8), np.uint8))[1].tobytes())
-    huge[18:26] = b"\0\0\1\0" * 2  # 65536 px wide and high, it claims; OpenCV goes by content, not by name
+    huge[18:26] = b"\0\0\1\0" * 2  # a header that claims 65536 x 65536 px; OpenCV ignores the file suffix
     (dot_grid / "3.png").write_bytes(huge)
     refused("3.png", "cannot be read")
     cv2.imwrite(str(dot_grid / "3.png"), np.zeros((100, 100), np.uint8))
-    refused("pictures of one size", "100 x 100")
+    refused("images of one size", "100 x 100")

@@ -1,9 +1,9 @@
 from pathlib import Path
 
 import pytest
+
 from rafl.calibration.camera import OrthographicCamera, Plane
 from rafl.calibration.rig import Rig, read_rig, write_rig
-
 from rafl.common.errors import InputError
 
 CAMERA = OrthographicCamera(
@@ -20,7 +20,7 @@ CAMERA = OrthographicCamera(
 )
 
 
-def test_round_trip(tmp_path: Path) -> None:
+def test_written_rig_reads_back(tmp_path: Path) -> None:
     write_rig(tmp_path / "calib.yaml", Rig({"left": CAMERA}))
     back = read_rig(tmp_path / "calib.yaml").cameras["left"]
     assert isinstance(back, OrthographicCamera)
@@ -35,7 +35,7 @@ def test_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "part"),
+    ("old", "new", "message"),
     [
         ("rafl-calibration/1", "rafl-calibration/2", "newer"),
         ("orthographic", "fisheye", "left"),
@@ -45,11 +45,11 @@ def test_round_trip(tmp_path: Path) -> None:
         ("[0.0, -1.0, 0.0]", "[0.0, -2.0, 0.0]", "length 1"),
     ],
 )
-def test_bad_files_name_the_key(tmp_path: Path, old: str, new: str, part: str) -> None:
+def test_error_in_a_bad_file_names_the_key(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = tmp_path / "calib.yaml"
     write_rig(path, Rig({"left": CAMERA}))
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
-    with pytest.raises(InputError, match=part):
+    with pytest.raises(InputError, match=message):
         read_rig(path)

@@ -1,4 +1,4 @@
-"""What tests share besides fixtures."""
+"""Functions and paths that several tests share."""
 
 import os
 import subprocess
@@ -15,13 +15,19 @@ import numpy as np
 ROOT = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared")).resolve()
 
-FRAMES = 12  # of a ramp's video
+RAMP_FRAMES = 12  # frames of the video that `write_video` makes of `ramp_frame`
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
-def enter_command(line: list[str], folder: Path, out: Any, err: Any) -> None:
-    """Be a console script: its name and arguments, working folder, standard output and error."""
+def run_console_script(line: list[str], folder: Path, out: Any, err: Any) -> None:
+    """Replace this process by a console script.
+
+    Args:
+        line: name of the script and its arguments.
+        folder: working folder.
+        out, err: file descriptors for standard output and error, as `DupFd`.
+    """
     os.chdir(folder)
     for number, handle in ((1, out), (2, err)):
         os.dup2(handle.detach(), number)
@@ -31,7 +37,7 @@ def enter_command(line: list[str], folder: Path, out: Any, err: Any) -> None:
 
 
 def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> None:
-    """One line on standard error that names all parts, exit code 2, no traceback."""
+    """Assert exit code 2 and exactly one line on standard error, an error message that contains all parts."""
     assert result.returncode == 2, result.stdout + result.stderr
     lines = [line for line in result.stderr.splitlines() if line.strip()]
     assert len(lines) == 1, result.stderr
@@ -40,7 +46,7 @@ def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> Non
         assert part in lines[0], (part, lines[0])
 
 
-def picture(
+def draw_frame(
     dots: list[tuple[float, float, float, float, float]],
     size: tuple[int, int] = (200, 160),
     dark: bool = True,
@@ -49,7 +55,7 @@ def picture(
     seed: int = 0,
     contrast: float = 130.0,
 ) -> np.ndarray:
-    """Ellipses (x, y, long and short semi-axis, angle) drawn much finer and averaged down."""
+    """An image of elliptic dots (x, y, long and short semi-axis, angle), averaged from 8 x 8 samples a pixel."""
     n = 8
     cover = np.zeros(size[::-1])
     for x, y, a, b, angle in dots:
@@ -62,27 +68,30 @@ def picture(
         part = cv2.resize(inside, (right - left, bottom - top), interpolation=cv2.INTER_AREA)
         cover[top:bottom, left:right] = np.maximum(cover[top:bottom, left:right], part)
     level = (170.0 if dark else 60.0) + (-contrast if dark else contrast) * cv2.GaussianBlur(cover, (0, 0), blur)
-    level *= 1.0 + 0.001 * np.arange(size[0])  # light from the right
+    level *= 1.0 + 0.001 * np.arange(size[0])  # brighter towards the right
     return np.clip(np.rint(level + np.random.default_rng(seed).normal(0, noise, level.shape)), 0, 255).astype(np.uint8)
 
 
-def grid(columns: int = 8, rows: int = 3) -> np.ndarray:
-    """The places (N, 2) of dots in rows, 34 px apart."""
+def marker_grid(columns: int = 8, rows: int = 3) -> np.ndarray:
+    """Positions (N, 2) [px] of a marker grid with a spacing of 34 px."""
     x, y = np.meshgrid(40 + 34 * np.arange(columns), 80 + 34 * np.arange(rows))
     return np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
 
 
-def hand_drawn(random: np.random.Generator, radius: float, waves: float) -> np.ndarray:
-    """The outline (180, 2) of a dot drawn by hand about (0, 0), irregular by that share of its radius."""
-    turn = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)
+def irregular_outline(random: np.random.Generator, radius: float, roughness: float) -> np.ndarray:
+    """Outline (180, 2) [px] of an irregular dot about (0, 0). `roughness` is relative to the radius."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 180, endpoint=False)
     distance = np.full(180, radius)
     for k in range(2, 9):
-        distance += radius * waves * random.normal() / k**0.7 * np.cos(k * turn + random.uniform(0, 2 * np.pi))
-    return distance[:, None] * np.stack([np.cos(turn), np.sin(turn)], axis=1)
+        distance += radius * roughness * random.normal() / k**0.7 * np.cos(k * angle + random.uniform(0, 2 * np.pi))
+    return distance[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
-def outlined(outlines: list[np.ndarray], size: tuple[int, int], random: np.random.Generator) -> np.ndarray:
-    """Dark polygons (N, 2) on light skin, which the picture's edge may cut, blurred by 1 px, with noise."""
+def draw_outlines(outlines: list[np.ndarray], size: tuple[int, int], random: np.random.Generator) -> np.ndarray:
+    """An image of dark polygons (N, 2) on a light background, blurred by 1 px, with noise.
+
+    The polygons may extend beyond the image border.
+    """
     n, pad = 6, 24
     width, height = size[0] + 2 * pad, size[1] + 2 * pad
     fine = np.zeros((height * n, width * n), np.uint8)
@@ -94,14 +103,14 @@ def outlined(outlines: list[np.ndarray], size: tuple[int, int], random: np.rando
 
 
 def zero_crossing_frequency(z: np.ndarray, time_step: float) -> float:
-    """Of an oscillation about zero [Hz], from its first to its last upward crossing."""
+    """Frequency [Hz] of an oscillation about zero, from its first to its last upward zero crossing."""
     before = np.flatnonzero((z[:-1] < 0) & (z[1:] >= 0))
     times = time_step * (before + z[before] / (z[before] - z[before + 1]))
     return (len(times) - 1) / (times[-1] - times[0])
 
 
-def ramp(frame: int) -> np.ndarray:
-    """A smooth picture, another each frame, within the range every format keeps."""
+def ramp_frame(frame: int) -> np.ndarray:
+    """A smooth image that grows lighter with the frame number, with grey levels that every pixel format can store."""
     x, y = np.meshgrid(np.arange(96), np.arange(64))
     return (30 + x + 1.2 * y + 5 * frame).astype(np.uint8)
 
@@ -112,25 +121,28 @@ def write_video(
     pixels: str,
     rate: int = 100,
     options: dict[str, str] | None = None,
-    pictures: list[np.ndarray] | None = None,
+    frames: list[np.ndarray] | None = None,
     title: str = "",
 ) -> None:
-    """Of pictures (H, W), or of ramps that grow lighter."""
-    pictures = pictures or [ramp(number) for number in range(FRAMES)]
+    """Write a video of grey frames (H, W). The default are the frames of `ramp_frame`."""
+    frames = frames or [ramp_frame(number) for number in range(RAMP_FRAMES)]
     with av.open(str(path), "w") as output:
         output.metadata["title"] = title
         stream = output.add_stream(codec, rate=rate)
-        stream.height, stream.width = pictures[0].shape
+        stream.height, stream.width = frames[0].shape
         stream.pix_fmt = pixels
         stream.options = options or {}
-        for picture in pictures:
-            frame = av.VideoFrame.from_ndarray(picture, format="gray")
+        for image in frames:
+            frame = av.VideoFrame.from_ndarray(image, format="gray")
             output.mux(stream.encode(frame.reformat(format=pixels)))
         output.mux(stream.encode())
 
 
-def curled(turn: float, pairs: int = 7) -> np.ndarray:
-    """Pairs of markers on a strip (2 * pairs, 2) [px], 30 px apart; from the second on each turns on by that much."""
+def curled_strip(turn: float, pairs: int = 7) -> np.ndarray:
+    """Positions (2 * pairs, 2) [px] of marker pairs on a curled strip, 30 px apart.
+
+    The direction of the strip changes by `turn` [rad] from each pair to the next.
+    """
     angle = turn * np.arange(pairs)
     step = 30.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     normal = 16.0 * np.stack([-np.sin(angle), np.cos(angle)], axis=1)

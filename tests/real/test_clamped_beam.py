@@ -1,4 +1,4 @@
-"""A real silicone cantilever by motion capture: dataset and system identification."""
+"""A real silicone cantilever recorded by motion capture: dataset and system identification."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ pytestmark = [
 ]
 
 
-def test_a_fitted_material_beats_the_assumed_one_on_the_held_out_recording(run: Run, tmp_path: Path) -> None:
+def test_identified_material_reduces_the_error_on_the_held_out_recording(run: Run, tmp_path: Path) -> None:
     table = SPECIMENS / "clamped_beam_recordings.csv"
     capture = ("rafl-capture", SPECIMENS / "clamped_beam.yaml", FOLDER, "--recordings", table)
     result = run(*capture, "--out", "beam.h5")
@@ -38,13 +38,13 @@ def test_a_fitted_material_beats_the_assumed_one_on_the_held_out_recording(run: 
     assert errors["mean_mm"]["sysid"] < 0.7 * errors["mean_mm"]["original"]
 
 
-def test_the_release_is_found_where_the_study_begins(run: Run, tmp_path: Path) -> None:
-    """Within two frames of the first frame the recordings' own study uses, chosen by hand."""
+def test_detected_release_agrees_with_the_study(run: Run, tmp_path: Path) -> None:
+    """The release is within two frames of the first frame that the original study of the recordings chose by hand."""
     table = pd.read_csv(SPECIMENS / "clamped_beam_recordings.csv")
     table.drop(columns=["first_frame", "last_frame"]).to_csv(tmp_path / "recordings.csv", index=False)
     capture = ("rafl-capture", SPECIMENS / "clamped_beam.yaml", FOLDER, "--recordings", "recordings.csv")
     assert run(*capture, "--out", "beam.h5", "--tolerance-mm", "8").returncode == 0
-    found = read_dataset(tmp_path / "beam.h5").trajectories
+    trajectories = read_dataset(tmp_path / "beam.h5").trajectories
     for name, first in zip(table["recording"], table["first_frame"], strict=True):
-        assert abs(int(str(found[name].attributes["first_frame"])) - first) <= 2
-        assert int(str(found[name].attributes["still_frames"])) > 10
+        assert abs(int(str(trajectories[name].attributes["first_frame"])) - first) <= 2
+        assert int(str(trajectories[name].attributes["still_frames"])) > 10

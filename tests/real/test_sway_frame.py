@@ -1,4 +1,4 @@
-"""A model frame swayed by hand: 28 dots, 160 pictures, one camera."""
+"""Recording of a model frame that a hand sways: 28 dots, 160 frames, one camera."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -8,10 +8,11 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from support import SHARED, Run, write_video
+
 from rafl.tracking.linking.follow import follow
 from rafl.tracking.video.frame import Frame
 from rafl.tracking.video.reader import Reading, open_video
-from support import SHARED, Run, write_video
 
 FOLDER = SHARED / "real" / "sway_frame"
 pytestmark = [
@@ -30,7 +31,7 @@ cameras:
 """
 
 
-def test_every_dot_is_followed(run: Run, tmp_path: Path) -> None:
+def test_every_dot_is_tracked(run: Run, tmp_path: Path) -> None:
     (tmp_path / "calib.yaml").write_text(CALIB)
     result = run("rafl-track", FOLDER, "--calib", "calib.yaml", "--fps", "22.7", "--jobs", "1")
     assert result.returncode == 0, result.stderr
@@ -41,27 +42,27 @@ def test_every_dot_is_followed(run: Run, tmp_path: Path) -> None:
         assert float(file.attrs["fps"]) == pytest.approx(22.7)
     assert names == [f"r{row}c{column}" for row in (1, 2, 3, 4) for column in range(1, 8)]
     assert measured > 0.995
-    # Where the dots stood in the first frame, by eye.
+    # Positions of the dots in the first frame, read by eye.
     rows, columns = (471, 931, 1420, 1904), (148, 310, 466, 625, 778, 940, 1111)
     by_eye = np.array([(x, y) for y in rows for x in columns])
     assert np.abs(pixel[0] - by_eye).max() < 30
-    # Each row is a stiff bar: no dot takes another's place while the spacings hold.
+    # Each row is a stiff bar: constant spacings show that no identities are swapped.
     spacing = np.diff(pixel.reshape(160, 4, 7, 2)[..., 0], axis=2)
     assert np.nanmax(np.abs(spacing / np.nanmedian(spacing, axis=0) - 1.0)) < 0.05
-    # Before the hand comes it sways a little by itself: the even and the odd columns of every row show the same. What
-    # a row's dots do not share is noise.
-    moves = np.diff(pixel[:40], axis=0).reshape(39, 4, 7, 2) / np.sqrt(2)
-    even, odd = moves[:, :, ::2, 0].mean(axis=2), moves[:, :, 1::2, 0].mean(axis=2)
+    # Before the hand comes, the model sways slightly. The even and the odd columns of a row show the same motion; what
+    # differs between the dots of a row is noise.
+    motion = np.diff(pixel[:40], axis=0).reshape(39, 4, 7, 2) / np.sqrt(2)
+    even, odd = motion[:, :, ::2, 0].mean(axis=2), motion[:, :, 1::2, 0].mean(axis=2)
     assert min(np.corrcoef(even[:, row], odd[:, row])[0, 1] for row in range(4)) > 0.85
-    noise = np.sqrt(7 / 6) * (moves - moves.mean(axis=2, keepdims=True)).std(axis=0)
+    noise = np.sqrt(7 / 6) * (motion - motion.mean(axis=2, keepdims=True)).std(axis=0)
     assert np.median(noise) < 0.02
 
 
 @dataclass(frozen=True)
-class Barred:
-    """Stands in for the video: its pictures, from the second on with a grey bar painted over them, if any."""
+class OccludedVideo:
+    """Replaces the video: its frames, with a grey bar over them from the second frame on, if bars are given."""
 
-    bars: tuple[tuple[slice, slice], ...] = ()  # by picture
+    bars: tuple[tuple[slice, slice], ...] = ()  # rows and columns, by frame
     path: Path = FOLDER
 
     def read(self) -> Reading:
@@ -69,42 +70,42 @@ class Barred:
 
     def frames(self) -> Iterator[Frame]:
         for number, path in enumerate(sorted(FOLDER.glob("*.jpg"))):
-            picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-            assert picture is not None
+            image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+            assert image is not None
             if number and self.bars:
-                picture[self.bars[number]] = 120
-            yield Frame(number / 22.7, picture)
+                image[self.bars[number]] = 120
+            yield Frame(number / 22.7, image)
 
 
-@pytest.mark.parametrize("down", [False, True])
-def test_a_bar_that_passes_takes_no_names_with_it(down: bool) -> None:
-    """It hides two of seven columns or one of four rows at a time; where it cuts a dot, sigma says so."""
-    free = follow(Barred(), lambda: None)
-    ends, half = ((0, 2046), 260) if down else ((-200, 1500), 200)
+@pytest.mark.parametrize("downwards", [False, True])
+def test_passing_bar_does_not_change_identities(downwards: bool) -> None:
+    """The bar occludes two of seven columns or one of four rows at a time; partly occluded dots get a larger sigma."""
+    unoccluded = follow(OccludedVideo(), lambda: None)
+    ends, half = ((0, 2046), 260) if downwards else ((-200, 1500), 200)
     middle = np.linspace(*ends, 160).astype(int)
     bars = [slice(max(at - half, 0), max(at + half, 0)) for at in middle]
-    everywhere = slice(None)
-    video = Barred(tuple((bar, everywhere) if down else (everywhere, bar) for bar in bars))
+    everything = slice(None)
+    video = OccludedVideo(tuple((bar, everything) if downwards else (everything, bar) for bar in bars))
     tracks = follow(video, lambda: None)
-    order = np.linalg.norm(free.start[:, None] - tracks.start, axis=2).argmin(axis=1)
+    order = np.linalg.norm(unoccluded.start[:, None] - tracks.start, axis=2).argmin(axis=1)
     assert sorted(order) == list(range(28))
-    error = np.abs(tracks.pixel[:, order] - free.pixel)
-    sure = np.maximum(0.3, 5.0 * tracks.sigma[:, order])
-    assert not (error > sure).any()
-    behind = np.abs(free.pixel[..., int(down)] - middle[:, None]) < half + 15
-    behind[0] = False
-    assert np.isfinite(error[~behind]).mean() > 0.995
+    error = np.abs(tracks.pixel[:, order] - unoccluded.pixel)
+    limit = np.maximum(0.3, 5.0 * tracks.sigma[:, order])
+    assert not (error > limit).any()
+    occluded = np.abs(unoccluded.pixel[..., int(downwards)] - middle[:, None]) < half + 15
+    occluded[0] = False
+    assert np.isfinite(error[~occluded]).mean() > 0.995
 
 
-def test_sigma_knows_what_compression_does_to_it(tmp_path: Path) -> None:
-    """Coded again by H.264, it is off from where it was by as much as sigma says."""
-    before = follow(Barred(), lambda: None)
+def test_sigma_covers_the_compression_error(tmp_path: Path) -> None:
+    """Encoded again with H.264, the positions deviate from the earlier ones by as much as sigma states."""
+    original = follow(OccludedVideo(), lambda: None)
     path = tmp_path / "a.mkv"
-    pictures = [frame.picture for frame in Barred().frames() if frame.picture is not None]
-    write_video(path, "libx264", "yuv420p", options={"crf": "23"}, pictures=pictures)
-    coded = follow(open_video(path), lambda: None)
-    order = np.linalg.norm(before.start[:, None] - coded.start, axis=2).argmin(axis=1)
-    error, sigma = coded.pixel[:, order] - before.pixel, coded.sigma[:, order]
+    images = [frame.image for frame in OccludedVideo().frames() if frame.image is not None]
+    write_video(path, "libx264", "yuv420p", options={"crf": "23"}, frames=images)
+    compressed = follow(open_video(path), lambda: None)
+    order = np.linalg.norm(original.start[:, None] - compressed.start, axis=2).argmin(axis=1)
+    error, sigma = compressed.pixel[:, order] - original.pixel, compressed.sigma[:, order]
     measured = np.isfinite(error)
     assert measured.mean() > 0.995
     error, sigma = error[measured], sigma[measured]

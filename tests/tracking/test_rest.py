@@ -1,30 +1,30 @@
-"""`rafl-calibrate --from-rest`: cameras from a specimen that lies still."""
+"""`rafl-calibrate --from-rest`: cameras calibrated from videos of a specimen at rest."""
 
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
-from rafl.calibration.camera import OrthographicCamera
-from rafl.calibration.rest_pose import camera_from_points
-from rafl.calibration.rig import read_rig
-from rafl.tracking.cli import calibrate_app
-from rafl.tracking.linking.layout import read_layout
-from rafl.tracking.synthetic import Scene, draw, expose
 from scipy.spatial.transform import Rotation
 from support import ROOT, Run, assert_refused
 from typer.testing import CliRunner
 
+from rafl.calibration.camera import OrthographicCamera
+from rafl.calibration.rest_pose import camera_from_points
+from rafl.calibration.rig import read_rig
 from rafl.common.errors import InputError
+from rafl.tracking.cli import calibrate_app
+from rafl.tracking.linking.layout import read_layout
+from rafl.tracking.synthetic import Scene, draw, expose
 
 SPECIMEN = ROOT / "datasets/specimens/canonical.yaml"
 LAYOUT = read_layout(SPECIMEN)
 SIZE = (960, 400)
-SQUARE = {"y-min": [[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], "y-max": [[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]]}
+FACING = {"y-min": [[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]], "y-max": [[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]]}
 
 
-def camera(face: str, turn: list[float], scale: float = 7.3e3) -> OrthographicCamera:
-    rotation = Rotation.from_rotvec(np.radians(turn)).as_matrix() @ SQUARE[face]
+def camera(face: str, tilt_deg: list[float], scale: float = 7.3e3) -> OrthographicCamera:
+    rotation = Rotation.from_rotvec(np.radians(tilt_deg)).as_matrix() @ FACING[face]
     middle = scale * rotation[:2] @ [0.05, 0.015, 0.015]
     return OrthographicCamera(
         image_size=SIZE,
@@ -34,33 +34,33 @@ def camera(face: str, turn: list[float], scale: float = 7.3e3) -> OrthographicCa
     )
 
 
-def film(path: Path, truth: OrthographicCamera, face: str, shift: float = 0.0) -> None:
-    """Ten frames of the face's dots; in the last they stand `shift` px further."""
+def write_rest_video(path: Path, truth: OrthographicCamera, face: str, shift: float = 0.0) -> None:
+    """Ten frames of the dots of a face. In the last frame they are shifted by `shift` px."""
     path.parent.mkdir(exist_ok=True)
-    names = [k for k, name in enumerate(LAYOUT.names) if name.startswith("L" if face == "y-min" else "R")]
-    pixels = truth.project(LAYOUT.positions[names])
-    scene, random = Scene(size=SIZE, noise=2.0, slope=0.2), np.random.default_rng(5)
+    markers = [k for k, name in enumerate(LAYOUT.names) if name.startswith("L" if face == "y-min" else "R")]
+    pixels = truth.project(LAYOUT.positions[markers])
+    scene, random = Scene(size=SIZE, noise=2.0, light_falloff=0.2), np.random.default_rng(5)
     with av.open(str(path), "w") as output:
         stream = output.add_stream("ffv1", rate=100)
         stream.width, stream.height, stream.pix_fmt = *SIZE, "gray"
         for frame in range(10):
             now = pixels + shift * (frame == 9)
             dots = np.column_stack([now, np.full((len(now), 2), 9.0), np.zeros(len(now))])
-            picture = expose(draw(scene, dots, random, np.zeros((len(now), 2))), scene, random)
-            output.mux(stream.encode(av.VideoFrame.from_ndarray(picture, format="gray")))
+            image = expose(draw(scene, dots, random, np.zeros((len(now), 2))), scene, random)
+            output.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="gray")))
         output.mux(stream.encode())
 
 
-def test_two_cameras_that_each_see_one_face(run: Run, tmp_path: Path) -> None:
-    """One tilted so that its mirror image must be excluded by word, one so nearly square that none is needed."""
+def test_two_cameras_with_one_face_each(run: Run, tmp_path: Path) -> None:
+    """One camera is tilted and needs --tilt-sign; the other faces the specimen and needs none."""
     truth = {"left": camera("y-min", [3.0, 12.0, 2.0]), "right": camera("y-max", [0.0, 0.0, -4.0])}
-    for (name, own), face in zip(truth.items(), SQUARE, strict=True):
-        film(tmp_path / f"rest/{name}.mkv", own, face)
-    said = ["--from-rest", "rest", "--specimen", SPECIMEN, "--face", "left=y-min", "--face", "right=y-max"]
-    assert_refused(run("rafl-calibrate", *said), "left", "--tilt-sign left=+", "12.")
+    for (name, own), face in zip(truth.items(), FACING, strict=True):
+        write_rest_video(tmp_path / f"rest/{name}.mkv", own, face)
+    options = ["--from-rest", "rest", "--specimen", SPECIMEN, "--face", "left=y-min", "--face", "right=y-max"]
+    assert_refused(run("rafl-calibrate", *options), "left", "--tilt-sign left=+", "12.")
     assert not (tmp_path / "calib.yaml").exists()
     depth = (truth["left"].rotation @ [1.0, 0.0, 0.0])[2]
-    result = run("rafl-calibrate", *said, "--tilt-sign", f"left={'+' if depth > 0 else '-'}")
+    result = run("rafl-calibrate", *options, "--tilt-sign", f"left={'+' if depth > 0 else '-'}")
     assert result.returncode == 0, result.stderr
     assert "next: rafl-track" in result.stdout
     found = read_rig(tmp_path / "calib.yaml").cameras
@@ -74,11 +74,11 @@ def test_two_cameras_that_each_see_one_face(run: Run, tmp_path: Path) -> None:
         np.testing.assert_allclose(item.project(side), own.project(side), atol=0.05)
 
 
-def test_what_rest_cannot_tell_is_refused(run: Run, tmp_path: Path) -> None:
-    film(tmp_path / "still/left.mkv", camera("y-min", [0.0, 0.0, 0.0]), "y-min")
-    film(tmp_path / "moving/left.mkv", camera("y-min", [0.0, 0.0, 0.0]), "y-min", shift=6.0)
+def test_unsuitable_rest_videos_are_refused(run: Run, tmp_path: Path) -> None:
+    write_rest_video(tmp_path / "still/left.mkv", camera("y-min", [0.0, 0.0, 0.0]), "y-min")
+    write_rest_video(tmp_path / "moving/left.mkv", camera("y-min", [0.0, 0.0, 0.0]), "y-min", shift=6.0)
     rest = ["--from-rest", tmp_path / "still", "--specimen", SPECIMEN]
-    assert_refused(run("rafl-calibrate", *rest), "camera left", "y-min, y-max alike", "--face left=y-min")
+    assert_refused(run("rafl-calibrate", *rest), "camera left", "y-min, y-max equally well", "--face left=y-min")
     for given, words in (
         (["--from-rest", tmp_path / "moving", *rest[2:]], ("left.mkv", "at rest", "move by")),
         ([*rest, "--face", "left=front"], ("--face", "y-min", "left=front")),
@@ -93,8 +93,8 @@ def test_what_rest_cannot_tell_is_refused(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_markers_on_two_faces_leave_no_mirror(seed: int) -> None:
-    """Seen from a corner, points in space tell the camera by themselves, and its sigma is honest."""
+def test_markers_on_two_faces_determine_the_camera(seed: int) -> None:
+    """Markers that are not coplanar leave no mirror ambiguity. The errors are within 4 sigma."""
     random = np.random.default_rng(seed)
     truth = camera("y-min", list(random.uniform(-1, 1, 3) * [10.0, 10.0, 180.0] + [-40.0, 0.0, 0.0]))
     points = np.concatenate([LAYOUT.positions[:16], LAYOUT.positions[:16][:, [0, 2, 1]] + [0.0, 0.0, 0.03]])
@@ -106,7 +106,7 @@ def test_markers_on_two_faces_leave_no_mirror(seed: int) -> None:
     np.testing.assert_array_less(np.abs(np.array(found.offset) - truth.offset), 4 * sigma[6:8])
 
 
-def test_markers_in_a_line_or_too_few(random: np.random.Generator) -> None:
+def test_collinear_or_too_few_markers_are_refused(random: np.random.Generator) -> None:
     truth = camera("y-min", [0.0, 0.0, 0.0])
     for points, words in ((LAYOUT.positions[:8], "one line"), (LAYOUT.positions[[0, 3, 9, 12]], "found 4")):
         with pytest.raises(InputError, match=words):

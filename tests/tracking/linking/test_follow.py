@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import curled_strip, marker_grid, draw_frame
+from support import curled_strip, draw_frame, marker_grid
 
 from rafl.common.errors import InputError
 from rafl.tracking.linking.follow import PixelTracks, follow
