@@ -80,7 +80,7 @@ def test_track_refuses_wrong_input(videos: Path, run: Run, tmp_path: Path) -> No
     extra = {"other.yaml", "videos/swing/broken.png"}
     refused("nowhere.yaml", "check the path", calib="nowhere.yaml")
     refused("nothing", path=tmp_path / "nothing")
-    refused(".mp4", "calib.yaml, found a file of another kind", path=tmp_path / "calib.yaml")
+    refused(".mp4", "calib.yaml, found another file type", path=tmp_path / "calib.yaml")
     write_rig(tmp_path / "other.yaml", Rig({"front": camera((640, 480))}))
     refused("swing", "expected 640 x 480", "found 200 x 160", calib="other.yaml")
     write_rig(tmp_path / "other.yaml", Rig({"left": camera(), "right": camera()}))

@@ -18,6 +18,7 @@ from scipy.optimize import curve_fit
 
 from rafl.capture.dataset.build import CaptureSettings, build_dataset
 from rafl.capture.dataset.table import read_recording_rows
+from rafl.capture.registration.registration import RestPose
 from rafl.capture.specimen.specimen import read_specimen
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors
@@ -27,7 +28,7 @@ from rafl.fitting.sysid import identify_material
 from rafl.simulation.rollout import equilibrium
 
 SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
-REST = ("beam_gravity_V2_b", 65)  # recording and frame in which the beam is held straight
+REST = RestPose("beam_gravity_V2_b", 65, 65)  # recording and frame in which the beam is held straight
 IDENTIFICATION_FRAMES = 100  # leading frames that identification simulates
 
 CONFIGURATIONS: list[tuple[str, str, int, dict[str, Any]]] = [  # name, integrator, substeps, material
