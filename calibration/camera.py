@@ -18,7 +18,7 @@ class Plane:
     Attributes:
         normal: unit vector, world frame, (3).
         offset: [m].
-        sigma: standard deviation of the markers' distances from the plane [m].
+        sigma: of the markers' distances from the plane [m].
     """
 
     normal: tuple[float, float, float]

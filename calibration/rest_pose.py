@@ -26,7 +26,7 @@ PLANARITY_TOLERANCE = 0.02  # thickness over extent below which points count as 
 # Decrease of the sum of squared residuals, in variances of a residual, below which a tilt is not significant.
 MIN_TILT_GAIN = 9.2
 MIN_VISIBLE_SHORTENING = 3.0  # residuals by which a tilt must shorten a face to be detected
-HUBER_SIGMAS = 2.5  # the cost of a residual larger than this many standard deviations grows linearly
+HUBER_SIGMAS = 2.5  # the cost of a residual larger than this many sigmas grows linearly
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from rafl.common.files import write_text
 from rafl.common.yaml_files import StrictModel, read_yaml
 
 FORMAT = "rafl-calibration/1"
-PLANE_SIGMA_MM = 0.5  # standard deviation of the markers' distances from their plane, unless given
+PLANE_SIGMA_MM = 0.5  # of the markers' distances from their plane, unless given
 
 
 @dataclass(frozen=True)

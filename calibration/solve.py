@@ -25,7 +25,7 @@ Array = NDArray[Any]
 
 SAME_ROTATION = np.radians(0.5)  # rotations closer than this count as one solution
 MAX_RESIDUAL_RATIO = 1.3  # a solution whose residual is this many times the best one is rejected
-MIN_PERSPECTIVE_SIGMAS = 4.0  # an inverse distance of more standard deviations shows perspective
+MIN_PERSPECTIVE_SIGMAS = 4.0  # an inverse distance of more sigmas shows perspective
 COVARIANCE_PARAMETERS = 10  # camera parameters in the covariance in calib.yaml
 
 
@@ -37,7 +37,7 @@ class Solution:
         rig: cameras with residual, covariance and plane.
         view_residuals: RMS residual of each view [px].
         tilts: angle between the board and the image plane in each view [rad].
-        inverse_distances: of each camera, 1 / distance from the world origin and its standard deviation [1/m]; 0 for an
+        inverse_distances: of each camera, 1 / distance from the world origin and its sigma [1/m]; 0 for an
             orthographic lens.
     """
 

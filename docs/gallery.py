@@ -59,7 +59,7 @@ def motion(demo: Path) -> Image.Image:
         simulated = rafl.simulate(dataset, model, [name])[name]
         axes.plot(simulated.time, 1e3 * simulated.markers[:, tip, 2], style, label=label)
     axes.set(xlabel="time [s]", ylabel="height of the outermost marker [mm]")
-    axes.legend(loc="lower right", frameon=False)
+    axes.legend(loc="center right", frameon=False)
     buffer = io.BytesIO()
     figure.savefig(buffer)
     plt.close(figure)

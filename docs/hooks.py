@@ -49,7 +49,7 @@ def _table(name: str) -> str:
         wide = wide.join(paper.add_suffix(" (paper)"))
     if rows == "recording":
         wide.loc["mean"] = wide.mean()
-    return str(wide.round(3).reset_index().fillna("").to_markdown(index=False))
+    return str(wide.round(3).reset_index().astype(object).fillna("").to_markdown(index=False))
 
 
 def _bars(table: pd.DataFrame) -> plt.Figure:

@@ -156,7 +156,7 @@ def _histogram(tracks: Tracks, name: str) -> str:
     sigma = tracks.pixel_sigma[name]
     for axes, values, label, empty_text in (
         (left, _shared_residuals(tracks, name), "reprojection residual [px]", "no marker is seen by two cameras"),
-        (right, sigma[np.isfinite(sigma)], "standard deviation of a coordinate [px]", "no marker is seen"),
+        (right, sigma[np.isfinite(sigma)], "sigma of a coordinate [px]", "no marker is seen"),
     ):
         if len(values):
             axes.hist(values, bins=60, range=(0.0, float(np.quantile(values, 0.995)) + 1e-9), color="#1f6fb2")

@@ -19,10 +19,10 @@ class Scene:
         size: width, height [px].
         skin: grey level of the surface.
         dot: grey level of the dots.
-        blur: standard deviation of the lens blur [px].
-        noise: standard deviation of the sensor's noise [grey levels].
+        blur: sigma of the lens blur [px].
+        noise: sigma of the sensor's noise [grey levels].
         light_falloff: fraction of the light lost from the brightest to the darkest corner.
-        clutter: standard deviation of a mottled background beside the skin [grey levels].
+        clutter: sigma of a mottled background beside the skin [grey levels].
         skin_box: left, top, right, bottom of the skin [px]; None where it fills the frame.
         highlight_fraction: fraction of the dots with a specular highlight over their edge.
         supersampling: samples across a pixel: with 8, positions are exact to 1e-4 px, with 2, to 1e-2 px.
@@ -69,7 +69,7 @@ def coverage(shape: tuple[int, int], ellipse: Array, motion: Array, blur: float,
         shape: rows, columns.
         ellipse: x, y, semi-axes [px], angle of the first [rad], (5).
         motion: displacement during the exposure, centred at x, y [px], (2).
-        blur: standard deviation of the lens blur [px].
+        blur: sigma of the lens blur [px].
         samples: across a pixel.
     """
     instants = 1 + int(np.ceil(min(samples, 4) * np.hypot(*motion) / 2.0))
