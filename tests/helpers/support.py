@@ -12,6 +12,8 @@ import av
 import cv2
 import numpy as np
 
+from rafl.common.kernels import MESSAGE
+
 ROOT = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared")).resolve()
 
@@ -36,10 +38,15 @@ def run_console_script(line: list[str], folder: Path, out: Any, err: Any) -> Non
     sys.exit(script.load()())
 
 
+def error_lines(stderr: str) -> list[str]:
+    """The lines of standard error, but for the message that kernels are compiled."""
+    return [line for line in stderr.splitlines() if line.strip() and line != MESSAGE]
+
+
 def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> None:
     """Assert exit code 2 and exactly one line on standard error, an error message that contains all parts."""
     assert result.returncode == 2, result.stdout + result.stderr
-    lines = [line for line in result.stderr.splitlines() if line.strip()]
+    lines = error_lines(result.stderr)
     assert len(lines) == 1, result.stderr
     assert lines[0].startswith("error: ")
     for part in parts:

@@ -1,0 +1,67 @@
+"""Help and refusals of wrong arguments answer without importing heavy packages; options agree with the library."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from rafl import cli
+from rafl.capture import cli as capture_cli
+from rafl.capture.rendering.film import ENCODINGS
+from rafl.fitting.methods import METHODS
+from rafl.simulation.time_integration import INTEGRATORS
+from rafl.tracking import cli as tracking_cli
+from rafl.tracking.reconstruction.export import WRITERS
+
+HEAVY = {"cv2", "h5py", "matplotlib", "numba", "numpy", "pandas", "scipy", "torch", "trimesh"}
+PROGRAM = """
+import sys
+from importlib.metadata import entry_points
+sys.argv = sys.argv[1:]
+(script,) = entry_points(group="console_scripts", name=sys.argv[0])
+try:
+    script.load()()
+finally:
+    print("imported:", *sys.modules, file=sys.stderr)
+"""
+
+REFUSED = [
+    ["rafl-render", "absent.yaml", "--out", "out"],
+    ["rafl-calibrate", "absent"],
+    ["rafl-calibrate", "absent", "--model", "fisheye"],
+    ["rafl-track", "absent", "--calib", "absent.yaml"],
+    ["rafl-track", "absent", "--calib", "absent.yaml", "--export", "xls"],
+    ["rafl-capture", "absent.yaml"],
+    ["rafl-capture", "absent.yaml", "tracks", "--recordings", "absent.csv"],
+    ["rafl-capture", "--verify", "absent.h5"],
+    ["rafl-fit", "absent.h5"],
+    ["rafl-fit", "absent.h5", "--method", "magic"],
+    ["rafl-eval", "run"],
+    ["rafl-eval", "run", "absent.h5"],
+]
+COMMANDS = sorted({line[0] for line in REFUSED})
+
+
+def imported(line: list[str], folder: Path, code: int) -> set[str]:
+    """The modules that a command has imported when it ends, with this exit code."""
+    done = subprocess.run([sys.executable, "-c", PROGRAM, *line], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == code, done.stderr
+    return set(done.stderr.rpartition("imported: ")[2].split())
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_imports_nothing_heavy(name: str, tmp_path: Path) -> None:
+    assert not imported([name, "--help"], tmp_path, 0) & HEAVY
+
+
+@pytest.mark.parametrize("line", REFUSED, ids=" ".join)
+def test_refusal_imports_nothing_heavy(line: list[str], tmp_path: Path) -> None:
+    assert not imported(line, tmp_path, 2) & HEAVY
+
+
+def test_options_name_what_the_library_has() -> None:
+    assert tuple(METHODS) == cli.METHODS
+    assert tuple(INTEGRATORS) == cli.INTEGRATORS
+    assert tuple(WRITERS) == tracking_cli.EXPORT_FORMATS
+    assert {codec.value for codec in capture_cli.Codec} == set(ENCODINGS)
