@@ -113,7 +113,7 @@ class _RigFile(StrictModel):
     cameras: dict[str, _CameraEntry] = Field(min_length=1)
 
 
-def read_rig(path: str | Path) -> Rig:
+def read_calibration(path: str | Path) -> Rig:
     """Read `calib.yaml`.
 
     Raises:
@@ -173,7 +173,7 @@ def _entry(camera: Camera) -> dict[str, object]:
     return entry
 
 
-def write_rig(path: str | Path, rig: Rig) -> None:
+def write_calibration(path: str | Path, rig: Rig) -> None:
     """Write `calib.yaml`, completely or not at all."""
     path = Path(path)
     write_text(path, rig_text(rig))

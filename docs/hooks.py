@@ -8,6 +8,7 @@ import matplotlib
 import numpy as np
 import pandas as pd
 from latex2mathml.converter import convert
+from mkdocs.exceptions import PluginError
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -31,6 +32,17 @@ def on_page_markdown(markdown: str, **kwargs: Any) -> str:
     markdown = re.sub(r"<!-- table: (\S+) -->", lambda m: _table(m[1]), markdown)
     parts = re.split(r"(```.*?```|`[^`]*`)", markdown, flags=re.DOTALL)
     return "".join(part if part.startswith("`") else _with_equations(part) for part in parts)
+
+
+def on_page_content(html: str, page: Any, **kwargs: Any) -> str:
+    """Refuse a page in which a snippet was not filled in.
+
+    Raises:
+        PluginError: its marker is still there.
+    """
+    if "--8" in html:
+        raise PluginError(f"{page.file.src_path}: expected snippets to be filled in, found a marker")
+    return html
 
 
 def _with_equations(text: str) -> str:

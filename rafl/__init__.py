@@ -16,10 +16,12 @@ if TYPE_CHECKING:
         FittedModel,
         HexMesh,
         InputError,
+        Markers,
         Material,
         Parameters,
         ResidualField,
         ResidualForce,
+        ResidualModel,
         Rig,
         Simulation,
         SimulationError,
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
         Trajectory,
         build_dataset,
         calibrate,
+        equilibrium,
         evaluate,
         fit,
         load_model,
@@ -52,10 +55,12 @@ __all__ = [
     "FittedModel",
     "HexMesh",
     "InputError",
+    "Markers",
     "Material",
     "Parameters",
     "ResidualField",
     "ResidualForce",
+    "ResidualModel",
     "Rig",
     "Simulation",
     "SimulationError",
@@ -67,6 +72,7 @@ __all__ = [
     "__version__",
     "build_dataset",
     "calibrate",
+    "equilibrium",
     "evaluate",
     "fit",
     "load_model",
@@ -96,4 +102,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *__all__]
+    return sorted(__all__)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from rafl.calibration.board import read_board
 from rafl.calibration.board_images import board_views, check_shared_world
-from rafl.calibration.rig import Rig, read_rig, write_rig
+from rafl.calibration.rig import Rig, read_calibration, write_calibration
 from rafl.calibration.solve import solve_rig
 from rafl.capture.dataset.build import CaptureSettings
 from rafl.capture.dataset.build import build_dataset as build
@@ -22,13 +22,14 @@ from rafl.common.errors import InputError, SimulationError
 from rafl.common.marker_table import marker_table
 from rafl.data.dataset import Dataset, Trajectory
 from rafl.data.dataset_file import read_dataset, write_dataset
+from rafl.data.markers import Markers
 from rafl.data.objective import Recordings
 from rafl.data.synthetic import load_force
 from rafl.evaluation.metrics import compare, error_table
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.fitting.fit import fit
-from rafl.fitting.run_folder import FittedModel, load_model
+from rafl.fitting.run_folder import FittedModel, ResidualModel, load_model
 from rafl.residual.acceleration_field import ResidualField
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.rollout import ResidualForce, Start, equilibrium, rollout
@@ -44,10 +45,12 @@ __all__ = [
     "FittedModel",
     "HexMesh",
     "InputError",
+    "Markers",
     "Material",
     "Parameters",
     "ResidualField",
     "ResidualForce",
+    "ResidualModel",
     "Rig",
     "Simulation",
     "SimulationError",
@@ -58,6 +61,7 @@ __all__ = [
     "Trajectory",
     "build_dataset",
     "calibrate",
+    "equilibrium",
     "evaluate",
     "fit",
     "load_model",
@@ -78,9 +82,6 @@ Array = NDArray[Any]
 
 EQUILIBRIUM_STEPS = 200  # largest number of fixed-point steps towards an equilibrium with a residual force
 EQUILIBRIUM_TOLERANCE = 1e-7  # largest movement of a vertex in the last of these steps [m]; a marker's sigma is 1e-5 m
-
-read_calibration = read_rig
-write_calibration = write_rig
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,7 @@ def track(
     Raises:
         InputError: a file cannot be read, or a recording cannot be tracked.
     """
-    rig = read_rig(Path(calibration))
+    rig = read_calibration(Path(calibration))
     settings = TrackingSettings(read_layout(Path(specimen)) if specimen else None, fps, fill, sync)
     recordings = find_recordings(Path(videos), rig, Path(calibration))
     return {name: track_recording(sources, rig, settings, lambda: None) for name, sources in recordings.items()}
@@ -182,20 +183,20 @@ def build_dataset(
 
 
 def simulate(
-    dataset: Dataset, model: FittedModel | None = None, recordings: Sequence[str] | None = None
+    dataset: Dataset, model: FittedModel | ResidualModel | None = None, recordings: Sequence[str] | None = None
 ) -> dict[str, Simulation]:
     """Simulate recordings of a dataset from their first frames.
 
     Args:
         dataset: gives the mesh, the material and the first frames.
-        model: fitted model; None for the baseline simulator.
+        model: fitted model, or a residual model of your own; None for the baseline simulator.
         recordings: names; all if None.
 
     Raises:
         InputError: the model is not applicable to this mesh.
         SimulationError: a step did not converge; the message names it.
     """
-    chosen = FittedModel("original") if model is None else model
+    chosen = _fitted(model)
     names = list(dataset.trajectories) if recordings is None else list(recordings)
     simulator = chosen.simulator(dataset.simulator)
     batch = Recordings.of(dataset, names).in_simulator(simulator)
@@ -214,7 +215,7 @@ def simulate(
 
 def predict(
     specimen: Specimen,
-    model: FittedModel | None = None,
+    model: FittedModel | ResidualModel | None = None,
     *,
     load_g: float,
     frames: int = 100,
@@ -222,14 +223,16 @@ def predict(
 ) -> Simulation:
     """Predict the motion of a specimen that is let go from rest under a tip load.
 
-    The specimen need not have been filmed: the model was fitted on others.
+    The specimen need not have been filmed: the model was fitted on others. The motion starts in the equilibrium under
+    gravity, the load and the model's residual force.
 
     Args:
         specimen: shape, markers and assumed material.
-        model: fitted model; None for the baseline simulator.
+        model: fitted model, or a residual model of your own; None for the baseline simulator.
         load_g: mass that hangs on the tip until the release [g].
         frames: number of frames, the release included.
-        fps: frames per second.
+        fps: frames per second, and the time step of the simulation. Keep the frame rate of the training recordings:
+            numerical damping depends on the time step, and so does what a field has learned to compensate.
 
     Raises:
         InputError: an argument is out of range, the model is not applicable to this mesh, or a marker is off the
@@ -241,7 +244,7 @@ def predict(
             f"expected a load of at least 0 g, 2 frames and a positive frame rate, found {load_g:g} g, "
             f"{frames} frames, {fps:g} frames/s"
         )
-    chosen = FittedModel("original") if model is None else model
+    chosen = _fitted(model)
     simulator = chosen.simulator(specimen.simulator(1.0 / fps))
     residual, parameters = chosen.residual(simulator), chosen.parameters(simulator)
     markers = specimen.markers(2e-3)
@@ -282,11 +285,11 @@ def _loaded_shape(
     )
 
 
-def evaluate(models: Mapping[str, FittedModel], datasets: Sequence[Dataset]) -> pd.DataFrame:
+def evaluate(models: Mapping[str, FittedModel | ResidualModel], datasets: Sequence[Dataset]) -> pd.DataFrame:
     """The paper's error of the baseline simulator (`original`) and of models on recorded motions.
 
     Args:
-        models: by the name that the table shows.
+        models: fitted models, or residual models of your own, by the name that the table shows.
         datasets: recorded motions.
 
     Returns:
@@ -296,4 +299,12 @@ def evaluate(models: Mapping[str, FittedModel], datasets: Sequence[Dataset]) -> 
         InputError: a model is not applicable to a mesh.
         SimulationError: a step did not converge; the message names it.
     """
-    return error_table([item for dataset in datasets for item in compare(dataset, dict(models))])
+    fitted = {name: _fitted(model) for name, model in models.items()}
+    return error_table([item for dataset in datasets for item in compare(dataset, fitted)])
+
+
+def _fitted(model: FittedModel | ResidualModel | None) -> FittedModel:
+    """The model to simulate with, whatever it is given as."""
+    if model is None:
+        return FittedModel("original")
+    return model if isinstance(model, FittedModel) else FittedModel("own", own=model)

@@ -12,7 +12,7 @@ import pytest
 from support import Run, assert_refused, draw_frame
 
 from rafl.calibration.camera import OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, write_rig
+from rafl.calibration.rig import Rig, write_calibration
 from rafl.capture.dataset.build import CaptureSettings, build_dataset
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.rendering.motion import tip_load_release
@@ -47,7 +47,7 @@ def videos(tmp_path: Path) -> Path:
     for frame in range(6):
         dots = [(40 + 36 * i + frame, 40 + 36 * j, 6.0, 6.0, 0.0) for i in range(4) for j in range(3)]
         cv2.imwrite(str(folder / f"{frame:03d}.png"), draw_frame(dots, noise=1.0, seed=frame))
-    write_rig(tmp_path / "calib.yaml", Rig({"front": camera()}))
+    write_calibration(tmp_path / "calib.yaml", Rig({"front": camera()}))
     return tmp_path / "videos"
 
 
@@ -81,9 +81,9 @@ def test_track_refuses_wrong_input(videos: Path, run: Run, tmp_path: Path) -> No
     refused("nowhere.yaml", "check the path", calib="nowhere.yaml")
     refused("nothing", path=tmp_path / "nothing")
     refused(".mp4", "calib.yaml, found another file type", path=tmp_path / "calib.yaml")
-    write_rig(tmp_path / "other.yaml", Rig({"front": camera((640, 480))}))
+    write_calibration(tmp_path / "other.yaml", Rig({"front": camera((640, 480))}))
     refused("swing", "expected 640 x 480", "found 200 x 160", calib="other.yaml")
-    write_rig(tmp_path / "other.yaml", Rig({"left": camera(), "right": camera()}))
+    write_calibration(tmp_path / "other.yaml", Rig({"left": camera(), "right": camera()}))
     refused("other.yaml (left, right)", "'swing'", calib="other.yaml")
     (tmp_path / "other.yaml").write_text("cameras: []")
     refused("other.yaml", calib="other.yaml")

@@ -18,7 +18,7 @@ from support import draw_frame, error_lines
 from typer.testing import CliRunner
 
 from rafl.calibration.camera import OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, write_rig
+from rafl.calibration.rig import Rig, write_calibration
 from rafl.tracking.cli import track_app
 
 SIZE = (200, 160)
@@ -44,7 +44,7 @@ def lab(tmp_path: Path) -> Path:
     camera = OrthographicCamera(
         image_size=SIZE, scale=(1e4, 1e4), rotation_vector=(0.0, 0.0, 0.0), plane=Plane((0.0, 0.0, 1.0), 0.0, 5e-4)
     )
-    write_rig(tmp_path / "calib.yaml", Rig({"front": camera}))
+    write_calibration(tmp_path / "calib.yaml", Rig({"front": camera}))
     markers = [{"name": f"m{i}{j}", "at_mm": [4.0 + 3 * i, 4.0 + 3.5 * j, 0.0]} for i in range(4) for j in range(3)]
     specimen = {"format": "rafl-specimen/1", "markers": markers}
     (tmp_path / "specimen.yaml").write_text(yaml.safe_dump(specimen))

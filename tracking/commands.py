@@ -20,7 +20,7 @@ from threadpoolctl import threadpool_limits
 from rafl.calibration.board import read_board
 from rafl.calibration.board_images import board_views, check_shared_world
 from rafl.calibration.camera import Camera
-from rafl.calibration.rig import Rig, read_rig, write_rig
+from rafl.calibration.rig import Rig, read_calibration, write_calibration
 from rafl.calibration.solve import solve_rig
 from rafl.calibration.summary import camera_table, check_table, perspective_messages
 from rafl.calibration.validation import check_view, write_residual_plot
@@ -61,7 +61,7 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
     views, sizes = board_views(images, description)
     check_shared_world(views)
     solution = solve_rig(views, sizes, description, _tilt_signs(tilt_sign, list(views)), model)
-    write_rig(out, solution.rig)
+    write_calibration(out, solution.rig)
     Console(width=110).print(camera_table(solution, views))
     for line in perspective_messages(solution, depth, model):
         typer.echo(line)
@@ -105,7 +105,7 @@ def calibrate_from_rest(folder: Path, specimen: Path, face: list[str], tilt_sign
                 f"{camera.covariance[0][0] ** 0.5:.4f}",
             )
             table.add_row(name, view.face, str(view.markers), *numbers, tilt)
-    write_rig(out, Rig(cameras))
+    write_calibration(out, Rig(cameras))
     Console(width=110).print(table)
     typer.echo("assumed: square pixels, no lens distortion, no perspective; only a board shows whether they hold")
     _print_next(out)
@@ -118,7 +118,7 @@ def check_calibration(calib: Path, images: Path, board: Path) -> None:
         InputError: a file cannot be read, or the images are not of the calibrated cameras.
     """
     views, sizes = board_views(images, read_board(board))
-    rig = read_rig(calib)
+    rig = read_calibration(calib)
     checked = {}
     for name, own in views.items():
         if name not in rig.cameras:
@@ -197,7 +197,7 @@ def track(
         typer.Exit: some recordings could not be tracked; code 1.
     """
     announce_compilation()
-    rig = read_rig(calib)
+    rig = read_calibration(calib)
     settings = TrackingSettings(read_layout(specimen) if specimen else None, fps, fill, sync)
     recordings = find_recordings(videos, rig, calib)
     done: dict[str, Tracks] = {}

@@ -7,7 +7,7 @@ dataset = rafl.build_dataset("specimen.yaml", "tracks/", "recordings.csv")
 rafl.write_dataset("beam.h5", dataset)
 
 # Fit a model. The call writes the run folder and returns the model.
-model = rafl.fit(["beam.h5"], "runs/beam", method="rafl", epochs=2, warm_start=2)
+model = rafl.fit("beam.h5", "runs/beam", epochs=4)  # a real fit: leave epochs out
 
 # Errors [mm] of the baseline simulator (`original`) and the model, by recording.
 errors = rafl.evaluate({"rafl": model}, [dataset])

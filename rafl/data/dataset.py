@@ -66,6 +66,12 @@ class Dataset:
     trajectories: dict[str, Trajectory]
     recipe: str = ""
 
+    def __repr__(self) -> str:
+        return (
+            f"Dataset({self.name!r}, {len(self.trajectories)} recordings, {len(self.markers.names)} markers, "
+            f"{len(self.simulator.mesh.vertices)} vertices)"
+        )
+
     def split(self, name: str) -> list[str]:
         """Names of the recordings of a split, in order."""
         return [key for key, item in self.trajectories.items() if item.split == name]

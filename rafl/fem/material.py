@@ -31,13 +31,16 @@ def lame(youngs_modulus: Any, poissons_ratio: Any) -> tuple[Any, Any]:
 class Material:
     """A homogeneous, nearly incompressible rubber.
 
+    The defaults are those of the paper's simulator. A specimen file takes the preset `physical` instead, which is
+    closer to a real specimen: `Material(mass="lumped", law="corotated")`.
+
     Attributes:
         youngs_modulus: E [Pa].
         poissons_ratio: nu, below 0.5.
         density: rho [kg/m^3].
-        mass: mass model. `uniform`: every node has rho times the mean cell volume, as in the paper's
-            simulator; a beam then has about twice its true mass. `lumped`: every node has its share of the
-            adjacent cells' mass; the sum is the true mass.
+        mass: mass model. `lumped`: every node has its share of the adjacent cells' mass; the sum is the true mass.
+            `uniform`: every node has rho times the mean cell volume, as in the paper's simulator. The sum is about
+            twice the true mass of the paper's beams, and more on coarser meshes.
         law: elastic law, one of `rafl.fem.laws.LAWS`.
         integration: `full`: eight points per cell. `selective`: the lambda term sees the cell's mean
             strain only (B-bar), so nearly incompressible cells do not lock in bending.

@@ -51,8 +51,15 @@ class HexMesh:
 
     @classmethod
     def box(cls, cells: ArrayLike, size: ArrayLike) -> "HexMesh":
-        """A box with `cells` (3) cells and edges `size` (3) [m]. One corner is the origin; vertices run z fastest."""
-        nx, ny, nz = (int(n) for n in np.asarray(cells))
+        """A box with `cells` (3) cells and edges `size` (3) [m]. One corner is the origin; vertices run z fastest.
+
+        Raises:
+            ValueError: a number of cells is no integer above 0.
+        """
+        counts = np.asarray(cells)
+        if counts.shape != (3,) or (counts != counts.astype(np.int64)).any() or (counts < 1).any():
+            raise ValueError(f"expected three numbers of cells of at least 1, got {cells!r}")
+        nx, ny, nz = (int(n) for n in counts)
         axes = [np.linspace(0.0, s, n + 1) for s, n in zip(np.asarray(size), (nx, ny, nz), strict=True)]
         vertices = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
         i, j, k = (a.ravel() for a in np.meshgrid(*map(np.arange, (nx, ny, nz)), indexing="ij"))

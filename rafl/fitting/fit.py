@@ -15,7 +15,7 @@ from rafl.fitting.warm_start import MAX_VERTICES
 
 
 def fit(
-    datasets: Sequence[str | Path],
+    datasets: str | Path | Sequence[str | Path],
     run: str | Path,
     method: str = "rafl",
     *,
@@ -38,7 +38,7 @@ def fit(
     """Fit a model to the `train` recordings of datasets and keep the one with the least `val` error.
 
     Args:
-        datasets: dataset files.
+        datasets: dataset files, or one.
         run: folder for model.pt, history.csv, config.yaml and the checkpoint; must not hold a run yet.
         method: `rafl` (residual acceleration field), `srl` (supervised baseline), `sysid` (E and nu), `sysid-e` (E at
             nu = 0.499) or `sysid-damping` (E, nu and viscosity).
@@ -62,10 +62,11 @@ def fit(
         InputError: a file, the run folder or an option does not suit the method.
         SimulationError: the simulator did not converge; the message names recording and step.
     """
-    loaded = [read_dataset(Path(path)) for path in datasets]
+    paths = [Path(path) for path in ([datasets] if isinstance(datasets, str | Path) else datasets)]
+    loaded = [read_dataset(path) for path in paths]
     settings = Settings(
         method=method,
-        datasets=tuple(str(Path(path).resolve()) for path in datasets),
+        datasets=tuple(str(path.resolve()) for path in paths),
         epochs=epochs or DEFAULT_EPOCHS.get(method, 1),
         learning_rate=learning_rate,
         weight_decay=weight_decay,

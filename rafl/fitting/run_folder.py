@@ -1,6 +1,6 @@
 """The run folder: the fitted model, its settings, its history and the checkpoint to resume from."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -25,6 +25,10 @@ FORMAT = "rafl-run/1"
 TIME_INTEGRATION_KEY = "stepping"  # in model.pt
 
 
+# A residual model of a user's own: makes the residual force on the mesh of a simulator.
+ResidualModel = Callable[[Simulator], ResidualForce]
+
+
 @dataclass(frozen=True)
 class FittedModel:
     """The result of a fit: a residual field, identified material parameters, or both, and their time integration.
@@ -37,6 +41,7 @@ class FittedModel:
         network: from the whole state to nodal forces, for `srl`.
         time_integration: `integrator` and `substeps` of the simulator that the model was fitted in; None for the
             specimen's own.
+        own: a residual model that was not fitted by this package. It is not saved.
     """
 
     method: str
@@ -44,6 +49,7 @@ class FittedModel:
     material: dict[str, float] | None = None
     network: GlobalResidual | None = None
     time_integration: dict[str, Any] | None = None
+    own: ResidualModel | None = None
 
     def simulator(self, own: Simulator) -> Simulator:
         """A specimen's simulator with the time integration that this model was fitted with."""
@@ -55,6 +61,8 @@ class FittedModel:
         Raises:
             InputError: the model is not applicable to this mesh.
         """
+        if self.own is not None:
+            return self.own(simulator)
         residual = self.field or self.network
         return residual.on(simulator) if residual is not None else None
 

@@ -35,6 +35,13 @@ class Start:
     added_mass: Tensor
     names: tuple[str, ...]
 
+    @classmethod
+    def at_rest(cls, q: Tensor, force: Tensor | None = None, names: tuple[str, ...] | None = None) -> "Start":
+        """Trajectories that start at rest at positions q (B, N, 3) [m], under constant forces (B, N, 3) [N] or none."""
+        none = torch.zeros_like(q)
+        labels = names or tuple(f"trajectory {number}" for number in range(len(q)))
+        return cls(q, none, none if force is None else force, none[..., 0], labels)
+
 
 @dataclass(frozen=True)
 class _BodyBatch:
@@ -101,10 +108,10 @@ def rollout(
 
     Args:
         simulator: the specimen.
-        start: initial state and loads.
-        steps: number of time steps T.
+        start: initial state and loads. Its positions of the fixed nodes are those of the clamp.
+        steps: number of time steps T, one per frame.
         residual: (q, v, external force with gravity) -> nodal force (B, N, 3) [N]. It is applied explicitly: evaluated
-            at the start of each time step and constant during the step.
+            once per frame, at its start, and constant during the frame, also with substeps.
         parameters: replace those of the simulator, see `simulator.parameters(...)`; may differ by trajectory.
         clamp: positions of the fixed nodes after each step [m], (T, B, F, 3); without it they do not move.
 

@@ -21,7 +21,7 @@ from rafl.solvers.linear import Factors
 
 Array = NDArray[Any]
 
-GRAVITY = (0.0, 0.0, -9.80709)  # [m/s^2]
+GRAVITY = (0.0, 0.0, -9.80709)  # [m/s^2]; the value of the paper's simulator
 ARITHMETIC = ("compiled", "plain")
 MAX_GRAVITY_ACROSS = 0.02  # largest component of gravity normal to a symmetry plane, relative to its magnitude
 FIRST_LOAD_STEPS, MAX_LOAD_STEPS = 8, 64  # of an equilibrium whose load is applied in steps
@@ -63,6 +63,11 @@ class Simulator:
                 raise ValueError(f"expected {key} to be one of {', '.join(known)}, got {getattr(self, key)!r}")
         if self.device != "cpu" and self.arithmetic != "plain":
             raise ValueError(f"expected arithmetic to be plain on device {self.device!r}, got {self.arithmetic!r}")
+        fixed, nodes = np.asarray(self.fixed), len(self.mesh.vertices)
+        if not (np.issubdtype(fixed.dtype, np.integer) and ((fixed >= 0) & (fixed < nodes)).all()):
+            raise ValueError(
+                f"expected fixed to hold node indices from 0 to {nodes - 1}, got {fixed.dtype} {fixed!r:.60}"
+            )
         if not (self.time_step > 0 and self.substeps >= 1):
             raise ValueError(f"expected time_step > 0 and substeps >= 1, got {self.time_step} and {self.substeps}")
 

@@ -10,7 +10,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from support import Run, assert_refused
 
-from rafl.calibration.rig import read_rig
+from rafl.calibration.rig import read_calibration
 
 SCALE = 9.0  # px/mm
 
@@ -49,7 +49,7 @@ def test_dot_grid_calibrates_one_camera(dot_grid: Path, run: Run, tmp_path: Path
     result = run("rafl-calibrate", dot_grid, "--out", "calib.yaml")
     assert result.returncode == 0, result.stderr
     assert "next: rafl-track" in result.stdout
-    (camera,) = read_rig(tmp_path / "calib.yaml").cameras.values()
+    (camera,) = read_calibration(tmp_path / "calib.yaml").cameras.values()
     assert camera.scale == pytest.approx((9000.0, 9000.0), rel=1e-3)
     assert camera.residual < 0.1
     # The board in the first image is the world frame: its first dot is the origin, at pixel (100, 90).
@@ -68,7 +68,7 @@ def test_chessboard_calibration_is_checked_on_other_images(run: Run, tmp_path: P
     result = run("rafl-calibrate", "made", "--out", "calib.yaml")
     assert result.returncode == 0, result.stderr
     text = (tmp_path / "calib.yaml").read_text()
-    (camera,) = read_rig(tmp_path / "calib.yaml").cameras.values()
+    (camera,) = read_calibration(tmp_path / "calib.yaml").cameras.values()
     assert camera.scale == pytest.approx((9000.0, 9000.0), rel=1e-3)
     (tmp_path / "calib.yaml").write_text(text.replace("made:", "held:"))
     result = run("rafl-calibrate", "held", "--check", "calib.yaml")

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from rafl.calibration.camera import OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, read_rig, write_rig
+from rafl.calibration.rig import Rig, read_calibration, write_calibration
 from rafl.common.errors import InputError
 
 CAMERA = OrthographicCamera(
@@ -21,8 +21,8 @@ CAMERA = OrthographicCamera(
 
 
 def test_written_rig_reads_back(tmp_path: Path) -> None:
-    write_rig(tmp_path / "calib.yaml", Rig({"left": CAMERA}))
-    back = read_rig(tmp_path / "calib.yaml").cameras["left"]
+    write_calibration(tmp_path / "calib.yaml", Rig({"left": CAMERA}))
+    back = read_calibration(tmp_path / "calib.yaml").cameras["left"]
     assert isinstance(back, OrthographicCamera)
     for key in ("scale", "rotation_vector", "offset", "distortion"):
         assert getattr(back, key) == pytest.approx(getattr(CAMERA, key))
@@ -47,9 +47,9 @@ def test_written_rig_reads_back(tmp_path: Path) -> None:
 )
 def test_error_in_a_bad_file_names_the_key(tmp_path: Path, old: str, new: str, message: str) -> None:
     path = tmp_path / "calib.yaml"
-    write_rig(path, Rig({"left": CAMERA}))
+    write_calibration(path, Rig({"left": CAMERA}))
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new))
     with pytest.raises(InputError, match=message):
-        read_rig(path)
+        read_calibration(path)

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from rafl.calibration.camera import OrthographicCamera
 from rafl.calibration.rest_pose import camera_from_points
-from rafl.calibration.rig import read_rig
+from rafl.calibration.rig import read_calibration
 from rafl.common.errors import InputError
 from rafl.tracking.cli import calibrate_app
 from rafl.tracking.linking.layout import read_layout
@@ -63,7 +63,7 @@ def test_two_cameras_with_one_face_each(run: Run, tmp_path: Path) -> None:
     result = run("rafl-calibrate", *options, "--tilt-sign", f"left={'+' if depth > 0 else '-'}")
     assert result.returncode == 0, result.stderr
     assert "next: rafl-track" in result.stdout
-    found = read_rig(tmp_path / "calib.yaml").cameras
+    found = read_calibration(tmp_path / "calib.yaml").cameras
     for name, own in truth.items():
         item = found[name]
         assert isinstance(item, OrthographicCamera)
