@@ -8,13 +8,16 @@ from rafl.calibration.camera import OrthographicCamera, PinholeCamera
 from rafl.calibration.rig import Rig
 from rafl.calibration.solve import MIN_PERSPECTIVE_SIGMAS, Solution
 from rafl.calibration.validation import CheckedView
+from rafl.common.command_line import create_table
 
 MAX_SILENT_BIAS_M = 20e-6  # a larger marker error from a lens's perspective gives a warning
 
 
 def camera_table(solution: Solution, views: dict[str, list[View]]) -> Table:
     """The calibrated cameras: scale and its sigma, residual, and range of board tilts."""
-    table = Table("camera", "model", "views", "residual [px]", "px/mm along u, v", "+-", "tilts [deg]")
+    table = create_table(
+        "camera", "model", "views", "residual [px]", "px/mm along u, v", "sigma [px/mm]", "tilts [deg]"
+    )
     for name, camera in solution.rig.cameras.items():
         tilts = np.degrees([solution.tilts[view.name] for view in views[name]])
         if isinstance(camera, OrthographicCamera):
@@ -56,7 +59,7 @@ def perspective_messages(solution: Solution, depth: float, model: str) -> list[s
 
 def check_table(rig: Rig, checked: dict[str, list[CheckedView]]) -> Table:
     """Residuals of images that the calibration was not made from, beside the residual of the calibration."""
-    table = Table("camera", "image", "points", "residual [px]", "largest [px]", "in calibration [px]")
+    table = create_table("camera", "image", "points", "residual [px]", "largest [px]", "in calibration [px]")
     for name, views in checked.items():
         for item in views:
             largest = float(np.linalg.norm(item.residual, axis=1).max())

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from rafl.common.command_line import progress
+from rafl.common.command_line import create_table, progress
 from rafl.common.errors import InputError, SimulationError
 from rafl.common.files import write_text
 from rafl.common.kernels import announce_compilation
@@ -36,6 +36,7 @@ from rafl.fitting.run_folder import FittedModel, load_model
 from rafl.fitting.sysid import parameter_sentences
 from rafl.fitting.train_field import Report
 
+LABELS = {"missing": "residual targets not met"}  # of columns of the history, where its name says too little
 TORCH_THREADS = 1  # the network is small; the other cores run the element kernels
 
 
@@ -87,7 +88,9 @@ def _epoch_report(bar: Progress, task: TaskID, writer: Any, first: bool) -> Repo
         bar.update(task, completed=row.get("epoch", 0))
         if not first:
             return
-        values = ", ".join(f"{key} {value:.5g}" for key, value in row.items() if key != kind)
+        values = ", ".join(
+            f"{LABELS.get(key, key)} {value:.5g}" for key, value in row.items() if key != kind and value == value
+        )
         label = "epoch" if kind == "epoch" else "pre-training"
         bar.console.print(f"{label} {row[kind]:3.0f}: {values}", highlight=False, soft_wrap=True)
         if writer is not None:
@@ -179,7 +182,7 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
 
 
 def _error_table(splits: pd.DataFrame) -> Table:
-    table = Table("dataset", "split", "recordings", "method", "error [mm]")
+    table = create_table("dataset", "split", "recordings", "method", "error [mm]")
     for row in splits.itertuples():
         value = f"{row.mean_mm:.3f} +- {row.std_mm:.3f}"
         table.add_row(str(row.dataset), str(row.split), str(row.recordings), str(row.method), value)

@@ -24,7 +24,7 @@ from rafl.calibration.rig import Rig, read_calibration, write_calibration
 from rafl.calibration.solve import solve_rig
 from rafl.calibration.summary import camera_table, check_table, perspective_messages
 from rafl.calibration.validation import check_view, write_residual_plot
-from rafl.common.command_line import progress
+from rafl.common.command_line import create_table, progress
 from rafl.common.errors import InputError
 from rafl.common.kernels import announce_compilation
 from rafl.tracking.linking.layout import read_layout
@@ -41,6 +41,8 @@ from rafl.tracking.video.recordings import find_recordings
 SIGNAL_CHECK_S = 1.0
 # Longest time [s] that a thread waits for the interpreter. A decoder that waits for it decodes nothing.
 THREAD_SWITCH_S = 1e-4
+# Residual of a camera [px] from which its calibration gets a warning. Good images leave 0.02 to 0.2 px.
+LARGE_RESIDUAL_PX = 0.5
 
 
 def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth: float, out: Path) -> None:
@@ -63,6 +65,13 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
     solution = solve_rig(views, sizes, description, _tilt_signs(tilt_sign, list(views)), model)
     write_calibration(out, solution.rig)
     Console(width=110).print(camera_table(solution, views))
+    for name, camera in solution.rig.cameras.items():
+        if camera.residual > LARGE_RESIDUAL_PX:
+            typer.echo(
+                f"warning: camera {name}: the residual of {camera.residual:.3f} px is large; check the positions under "
+                "`world` and the pattern in board.yaml, and leave out blurred images",
+                err=True,
+            )
     for line in perspective_messages(solution, depth, model):
         typer.echo(line)
     _print_next(out)
@@ -86,7 +95,7 @@ def calibrate_from_rest(folder: Path, specimen: Path, face: list[str], tilt_sign
     videos = open_rest_videos(folder)
     faces = _values_by_camera("--face", face, list(videos), tuple(FACES))
     signs = _tilt_signs(tilt_sign, list(videos))
-    table = Table("camera", "face", "markers", "residual [px]", "px/mm", "+-", "tilt [deg]")
+    table = create_table("camera", "face", "markers", "residual [px]", "px/mm", "sigma [px/mm]", "tilt [deg]")
     cameras: dict[str, Camera] = {}
     with progress() as bar:
         for name, video in videos.items():
@@ -142,7 +151,7 @@ def check_calibration(calib: Path, images: Path, board: Path) -> None:
 
 def _print_next(out: Path) -> None:
     typer.echo(f"wrote {out}")
-    typer.echo(f"next: rafl-track videos/ --calib {out}")
+    typer.echo(f"next: rafl-track videos/ --calib {out} --specimen specimen.yaml")
 
 
 def _values_by_camera(option: str, given: list[str], cameras: list[str], allowed: tuple[str, ...]) -> dict[str, str]:
@@ -249,7 +258,7 @@ def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], k
     if kept:
         typer.echo(f"kept the tracks of {kept} recordings: nothing changed since they were tracked")
     typer.echo(f"wrote {len(done) - kept} tracks files to {out}/; look at {out}/report.html")
-    typer.echo(f"next: rafl-capture specimen.yaml {out} --recordings recordings.csv --out datasets/NAME.h5")
+    typer.echo(f"next: rafl-capture specimen.yaml {out} --recordings recordings.csv")
 
 
 @contextmanager
@@ -293,7 +302,9 @@ def _track_one(
 
 
 def _summary_table(done: dict[str, Tracks]) -> Table:
-    table = Table("recording", "frames", "markers", "measured", "filled", "missing", "sigma [px]", "residual [px]")
+    table = create_table(
+        "recording", "frames", "markers", "measured", "filled", "missing", "sigma [px]", "residual [px]"
+    )
     for name, tracks in done.items():
         table.add_row(name, *summary_cells(tracks))
     return table

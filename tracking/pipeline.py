@@ -102,7 +102,9 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     position, sigma, state = fill_gaps(position, sigma, clock, settings.fill)
     measured = int((state == MEASURED).any(axis=0).sum())
     if measured < MIN_MARKERS:
-        raise InputError(f"expected at least {MIN_MARKERS} markers, tracked {measured}; check the lighting")
+        raise InputError(
+            f"expected at least {MIN_MARKERS} markers, tracked {measured}; check the lighting and the calibration"
+        )
     for camera, item in followed.items():
         damaged = np.flatnonzero(item.damaged)
         if len(damaged):

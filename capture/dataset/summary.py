@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from rafl.common.command_line import create_table
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 
@@ -14,7 +15,7 @@ from rafl.data.dataset_file import read_dataset
 def recordings_table(dataset: Dataset) -> Table:
     """Table with one row per recording: split, load, first frame, and residuals of registration and first frame."""
     fits = ("registration [mm]", "first frame fit [mm]")
-    table = Table("recording", "split", "load [g]", "frames", "valid", "first frame", *fits)
+    table = create_table("recording", "split", "load [g]", "frames", "valid", "first frame", *fits)
     for name, item in dataset.trajectories.items():
         values = item.attributes
         averaged = int(str(values.get("still_frames", 0)))

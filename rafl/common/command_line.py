@@ -6,7 +6,9 @@ from typing import ParamSpec, TypeVar
 
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
 
 from rafl.common.errors import InputError
 
@@ -60,3 +62,8 @@ def progress() -> Progress:
         console=Console(stderr=True),
         transient=True,
     )
+
+
+def create_table(*headings: str, title: str | None = None) -> Table:
+    """A table for the terminal. Headings and title are shown as they are: rich takes "[px]" for a style."""
+    return Table(*map(escape, headings), title=title and escape(title))

@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from rich.console import Console
-from rich.table import Table
 
 from rafl.capture.registration.initial import FirstFrame, fit_first_frame
 from rafl.capture.registration.sequence import ITERATIONS, fit_by_sequence
 from rafl.capture.specimen.specimen import read_specimen
+from rafl.common.command_line import create_table
 from rafl.data.synthetic import loaded_equilibria
 
 CANONICAL = Path(__file__).parents[2] / "datasets" / "specimens" / "canonical.yaml"
@@ -31,7 +31,7 @@ def main() -> None:
     torch.set_num_threads(1)
     specimen, random = read_specimen(CANONICAL), np.random.default_rng(0)
     simulator, markers = specimen.simulator(0.01), specimen.markers(1e-6)
-    table = Table(
+    table = create_table(
         "load [g]",
         "method",
         "time [s]",

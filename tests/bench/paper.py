@@ -20,9 +20,9 @@ import pandas as pd
 import torch
 import yaml
 from rich.console import Console
-from rich.table import Table
 
 from rafl.capture.specimen.specimen import read_specimen
+from rafl.common.command_line import create_table
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset, write_dataset
@@ -283,7 +283,7 @@ def write_table(path: Path, table: pd.DataFrame, notes: list[str]) -> None:
 
 def show(title: str, table: pd.DataFrame) -> None:
     headings = ("shape", "method", "marker error [mm]", "paper's error [mm]", "compared with the paper")
-    printed = Table(*headings, title=title)
+    printed = create_table(*headings, title=title)
     for row in table.to_dict("records"):
         known = np.isfinite(row["paper_mean_mm"])
         paper = f"{row['paper_mean_mm']:.3f} +- {row['paper_std_mm']:.3f}" if known else ""

@@ -19,13 +19,12 @@ import torch
 import yaml
 from commands import run_command
 from rich.console import Console
-from rich.table import Table
 
 from rafl.capture.rendering.film import render_video, side_cameras, write_board_images
 from rafl.capture.rendering.motion import SimulatedMotion
 from rafl.capture.rendering.render import Appearance, Renderer
 from rafl.capture.specimen.specimen import Specimen, read_specimen
-from rafl.common.command_line import progress
+from rafl.common.command_line import create_table, progress
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
@@ -249,7 +248,7 @@ def errors_by_method(dataset: Dataset, models: dict[str, FittedModel]) -> pd.Dat
 
 
 def show(title: str, table: pd.DataFrame) -> None:
-    printed = Table("", *map(str, table.columns), title=title)
+    printed = create_table("", *map(str, table.columns), title=title)
     for name, row in table.iterrows():
         printed.add_row(str(name), *map(str, row))
     Console(width=170).print(printed)

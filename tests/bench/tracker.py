@@ -23,9 +23,9 @@ from geometry import measure_calibration, measure_reconstruction
 from localisation import measure_localisation
 from rich.console import Console
 from rich.markup import escape
-from rich.table import Table
 from threadpoolctl import threadpool_limits
 
+from rafl.common.command_line import create_table
 from rafl.tracking.commands import THREAD_SWITCH_S
 
 warnings.filterwarnings("ignore")
@@ -67,7 +67,7 @@ def main() -> None:
     for section in options.only.split(","):
         random = np.random.default_rng([options.seed, list(SECTIONS).index(section)])
         arguments = {"real": options.real} if section == "reconstructing" else {}
-        table = Table("quantity", "case", "value", "target", title=TITLES.get(section, section))
+        table = create_table("quantity", "case", "value", "target", title=TITLES.get(section, section))
         for item in SECTIONS[section](random, options.quick, **arguments):
             results.append((section, item))
             table.add_row(escape(item.quantity), item.case, f"{item.value:.4g}", item.target)
