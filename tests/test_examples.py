@@ -15,7 +15,7 @@ from rafl.capture.rendering.motion import tip_load_release
 from rafl.tracking.reconstruction.tracks import STATES
 
 EXAMPLES = ROOT / "docs" / "examples"
-FRAMES = 40
+FRAMES = 24
 LOADS_G = {"load060g": "train", "load070g": "val", "load080g": "test"}
 
 
