@@ -62,7 +62,8 @@ wheel: install
 # The wheel beside Hugging Face's package `datasets`, in an environment of its own.
 check-wheel: wheel
 	rm -rf build/wheel && python3 -m venv build/wheel
-	build/wheel/bin/pip install --quiet --constraint constraints.txt dist/rafl-*.whl datasets
+	build/wheel/bin/pip install --quiet --constraint constraints.txt dist/rafl-*.whl
+	build/wheel/bin/pip install --quiet datasets
 	cd build && wheel/bin/python ../tests/check_wheel.py
 
 # Tests that need the recordings and reference trajectories beside the checkout; skipped if they are absent.
