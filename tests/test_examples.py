@@ -11,6 +11,7 @@ import torch
 from support import ROOT, Run
 
 import rafl
+from rafl import api
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.tracking.reconstruction.tracks import STATES
 
@@ -128,5 +129,6 @@ def test_track(tmp_path: Path, specimen_file: Path, run: Run, monkeypatch: pytes
 
 
 def test_every_public_name_is_there_and_documented() -> None:
+    assert set(rafl.__all__) - {"__version__"} == set(api.__all__)
     for name in rafl.__all__:
         assert name in ("__version__", "ResidualForce", "ResidualModel") or getattr(rafl, name).__doc__, name
