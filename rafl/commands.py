@@ -1,6 +1,7 @@
 """What `rafl-fit` and `rafl-eval` do once their options are checked: call the library, print and write the results."""
 
 from collections import Counter
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -61,10 +62,10 @@ def fit(
     announce_compilation()
     run = out or Path("runs") / f"{read_dataset(paths[0]).name}-{method}"
     first = rank() == 0  # of the processes that torchrun started
-    writer = _open_writer(run) if tensorboard and first else None
+    open_writer = partial(_summary_writer(), run) if tensorboard and first else None
     with progress() as bar:
         task = bar.add_task("epoch", total=options["epochs"] or DEFAULT_EPOCHS[method])
-        report = _epoch_report(bar, task, writer, first)
+        report = _epoch_report(bar, task, open_writer, first)
         notify = partial(typer.echo, err=True)
         try:
             model = fit_model(paths, run, method, resume=resume, report=report, notify=notify, **options)
@@ -80,10 +81,12 @@ def fit(
     typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in paths)}")
 
 
-def _epoch_report(bar: Progress, task: TaskID, writer: Any, first: bool) -> Report:
-    """A function that prints one row of the history and passes it to TensorBoard."""
+def _epoch_report(bar: Progress, task: TaskID, open_writer: Callable[[], Any] | None, first: bool) -> Report:
+    """A function that prints one row of the history and passes it to TensorBoard, whose file the first row opens."""
+    writer: Any = None
 
     def report(row: dict[str, float]) -> None:
+        nonlocal writer
         kind = "epoch" if "epoch" in row else "warm_start"
         bar.update(task, completed=row.get("epoch", 0))
         if not first:
@@ -93,7 +96,8 @@ def _epoch_report(bar: Progress, task: TaskID, writer: Any, first: bool) -> Repo
         )
         label = "epoch" if kind == "epoch" else "pre-training"
         bar.console.print(f"{label} {row[kind]:3.0f}: {values}", highlight=False, soft_wrap=True)
-        if writer is not None:
+        if open_writer is not None:
+            writer = writer or open_writer()
             for key, value in row.items():
                 writer.add_scalar(f"{kind}/{key}", value, int(row[kind]))
             writer.flush()
@@ -101,8 +105,8 @@ def _epoch_report(bar: Progress, task: TaskID, writer: Any, first: bool) -> Repo
     return report
 
 
-def _open_writer(run: Path) -> Any:
-    """TensorBoard's writer for a run folder.
+def _summary_writer() -> Any:
+    """TensorBoard's class of writers.
 
     Raises:
         InputError: the package tensorboard is not installed.
@@ -114,7 +118,7 @@ def _open_writer(run: Path) -> Any:
             "--tensorboard: expected the package tensorboard, found none; pip install tensorboard, or leave the option "
             "out (history.csv holds the same values)"
         ) from None
-    return SummaryWriter(run)
+    return SummaryWriter
 
 
 def _failed_simulation(error: SimulationError) -> typer.Exit:
