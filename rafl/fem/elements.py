@@ -41,7 +41,7 @@ _projective = projective.derivatives
 _corotated = corotated.derivatives
 _neo_hookean = neo_hookean.derivatives
 
-_component_gradient = weighted_rows(8, 3, 24)  # sum over nodes of nodal value times gradient
+component_gradient = weighted_rows(8, 3, 24)  # sum over nodes of nodal value times gradient
 _add_nodal_force = weighted_rows(3, 8, 8, add=True)
 _tangent_times_gradients = weighted_rows(3, 8, 8)
 _mode_products = lane_products(9, 72, 72)
@@ -49,7 +49,7 @@ _add_stiffness_block = transposed_product(24)
 
 
 @njit(**KERNEL_OPTIONS)
-def _project_semidefinite(w):
+def project_semidefinite(w):
     """Project the second derivatives, flips and twists of each point to positive semi-definite ones."""
     A = np.empty((3, 3))
     for g in range(8):
@@ -75,7 +75,7 @@ def _project_semidefinite(w):
 
 
 @njit(**KERNEL_OPTIONS)
-def _fill_stress(w):
+def fill_stress(w):
     """Fill STRESS with weight times P = U diag(psi_i) V^T, and TWIST."""
     for i in range(3):
         for j in range(3):
@@ -94,7 +94,7 @@ def _fill_stress(w):
 
 
 @njit(**KERNEL_OPTIONS)
-def _fill_tangent(w):
+def fill_tangent(w):
     """Fill TANGENT with weight times d P / d F (9 x 9), from nine modes: three stretches, two matrices per pair."""
     for m in range(3):
         following = (m + 1) % 3
@@ -140,15 +140,12 @@ def _fill_tangent(w):
 
 
 @njit(**KERNEL_OPTIONS)
-def _add_damping(w, moduli, velocity_gradient, strain_offset, velocity_factor, strain_factor, project, tangent):
-    """Add the viscous stress F (2 eta dE/dt) and the stiffness-proportional stress to STRESS, ENERGY and TANGENT.
+def add_viscous_stress(w, viscous_modulus, memory, project, tangent):
+    """Add the viscous stress F S, S = 2 (g E - memory), with g the viscous modulus, to STRESS, ENERGY and TANGENT.
 
-    velocity_gradient (9, 8): in the rest frame [1/s]. strain_offset (8, 6): dE/dt is
-    strain_factor * E - strain_offset [1/s].
+    memory (8, 6) [Pa].
     """
-    eta = moduli[2]
-    mu = moduli[3]
-    lam = moduli[4]
+    g_modulus = viscous_modulus
     F = np.empty((3, 3))
     S = np.empty((3, 3))
     for g in range(8):
@@ -163,39 +160,54 @@ def _add_damping(w, moduli, velocity_gradient, strain_offset, velocity_factor, s
                 for k in range(3):
                     green += 0.5 * F[k, i] * F[k, j]
                 component = i if i == j else (5 if j - i == 2 else 3 + i)
-                S[i, j] = S[j, i] = strain_factor * green - strain_offset[g, component]
-                energy += (1.0 if i == j else 2.0) * eta / strain_factor * S[i, j] * S[i, j]
-                S[i, j] = S[j, i] = 2.0 * eta * S[i, j]
-        trace = velocity_gradient[0, g] + velocity_gradient[4, g] + velocity_gradient[8, g]
-        energy += 0.5 / velocity_factor * lam * trace * trace
+                half = g_modulus * green - memory[g, component]
+                energy += (1.0 if i == j else 2.0) / g_modulus * half * half
+                S[i, j] = S[j, i] = 2.0 * half
+        w[ENERGY * 8 + g] += energy
         for i in range(3):
             for j in range(3):
-                strain_rate = 0.5 * (velocity_gradient[3 * i + j, g] + velocity_gradient[3 * j + i, g])
-                energy += mu / velocity_factor * strain_rate * strain_rate
-                stress = 2.0 * mu * strain_rate + (lam * trace if i == j else 0.0)
-                for k in range(3):
-                    stress += F[i, k] * S[k, j]
+                stress = F[i, 0] * S[0, j] + F[i, 1] * S[1, j] + F[i, 2] * S[2, j]
                 w[(STRESS + 3 * i + j) * 8 + g] += weight * stress
-        w[ENERGY * 8 + g] += energy
         if not tangent:
             continue
         for i in range(3):
             for j in range(3):
                 for k in range(3):
                     for m in range(3):
-                        value = eta * strain_factor * F[i, m] * F[k, j]
+                        value = g_modulus * F[i, m] * F[k, j]
                         if j == m:
                             for n in range(3):
-                                value += eta * strain_factor * F[i, n] * F[k, n]
-                        if i == k:
-                            value += velocity_factor * mu * (1.0 if j == m else 0.0)
-                            if not project:
-                                value += S[j, m]
-                        if i == m and j == k:
-                            value += velocity_factor * mu
-                        if i == j and k == m:
-                            value += velocity_factor * lam
+                                value += g_modulus * F[i, n] * F[k, n]
+                        if i == k and not project:
+                            value += S[j, m]
                         w[(TANGENT + 9 * (3 * i + j) + 3 * k + m) * 8 + g] += weight * value
+
+
+@njit(**KERNEL_OPTIONS)
+def add_damping_stress(w, mu, lam, velocity_gradient, velocity_factor, tangent):
+    """Add the stress of stiffness damping, 2 mu D + lam tr(D) I, to STRESS, ENERGY and TANGENT.
+
+    mu and lam [Pa s] are those at rest times the damping coefficient. velocity_gradient (9, 8): in the rest frame
+    [1/s]; D is its symmetric part.
+    """
+    for g in range(8):
+        weight = w[WEIGHT * 8 + g]
+        trace = velocity_gradient[0, g] + velocity_gradient[4, g] + velocity_gradient[8, g]
+        energy = 0.5 / velocity_factor * lam * trace * trace
+        for i in range(3):
+            for j in range(3):
+                strain_rate = 0.5 * (velocity_gradient[3 * i + j, g] + velocity_gradient[3 * j + i, g])
+                energy += mu / velocity_factor * strain_rate * strain_rate
+                stress = 2.0 * mu * strain_rate + (lam * trace if i == j else 0.0)
+                w[(STRESS + 3 * i + j) * 8 + g] += weight * stress
+        w[ENERGY * 8 + g] += energy
+        if not tangent:
+            continue
+        for i in range(3):
+            for j in range(3):
+                w[(TANGENT + 9 * (3 * i + j) + 3 * i + j) * 8 + g] += weight * velocity_factor * mu
+                w[(TANGENT + 9 * (3 * i + j) + 3 * j + i) * 8 + g] += weight * velocity_factor * mu
+                w[(TANGENT + 9 * (4 * i) + 4 * j) * 8 + g] += weight * velocity_factor * lam
 
 
 @njit(**KERNEL_OPTIONS)
@@ -207,12 +219,12 @@ def _add_cell(
     law,
     mu,
     lam,
-    damped,
     moduli,
+    viscous,
+    memory,
+    damped,
     velocity_gradient,
-    strain_offset,
     velocity_factor,
-    strain_factor,
     project,
     tangent,
 ):
@@ -224,7 +236,7 @@ def _add_cell(
         w[SHAPE_GRADIENTS * 8 + i] = gradients_by_node[i]
     for i in range(3):
         for j in range(3):
-            _component_gradient(w, (DEFORMATION + 3 * i + j) * 8, x, i, gradients_by_point, 8 * j)
+            component_gradient(w, (DEFORMATION + 3 * i + j) * 8, x, i, gradients_by_point, 8 * j)
     signed_svd_simd(w)
     if law == 0:
         _projective(w, mu, lam)
@@ -232,18 +244,18 @@ def _add_cell(
         _corotated(w, mu, lam)
     else:
         _neo_hookean(w, mu, lam)
-    _fill_stress(w)
+    fill_stress(w)
     if tangent:
         if project:
-            _project_semidefinite(w)
-        _fill_tangent(w)
+            project_semidefinite(w)
+        fill_tangent(w)
+    if viscous and moduli[2] > 0.0:
+        add_viscous_stress(w, moduli[2], memory, project, tangent)
     if damped:
         for i in range(3):
             for j in range(3):
-                _component_gradient(velocity_gradient, (3 * i + j) * 8, x, 24 + i, gradients_by_point, 8 * j)
-        _add_damping(
-            w, moduli, velocity_gradient.reshape(9, 8), strain_offset, velocity_factor, strain_factor, project, tangent
-        )
+                component_gradient(velocity_gradient, (3 * i + j) * 8, x, 24 + i, gradients_by_point, 8 * j)
+        add_damping_stress(w, moduli[3], moduli[4], velocity_gradient.reshape(9, 8), velocity_factor, tangent)
     energy = 0.0
     for g in range(8):
         energy += w[WEIGHT * 8 + g] * w[ENERGY * 8 + g]
@@ -278,11 +290,11 @@ def element_terms(
     group_shares,
     law,
     moduli,
+    viscous,
+    memory,
     damped,
     velocity_offset,
-    strain_offset,
     velocity_factor,
-    strain_factor,
     project,
     tangent,
     energy,
@@ -299,11 +311,12 @@ def element_terms(
         volume: of each point [m^3], (E, G, 8).
         group_shares: fraction of mu and of lambda that each group of points integrates, (G, 2).
         law: index of the elastic law in `LAWS`.
-        moduli: mu, lambda [Pa]; viscosity, stiffness damping times rest mu and lambda [Pa s]; (B, 5).
-        damped: whether damping acts; if not, the last three moduli and the next four arguments are ignored.
+        moduli: see `rafl.fem.constitutive_state.MODULI`, (B, 5).
+        viscous: whether viscous stress acts, with `memory`.
+        memory: of the viscous stress [Pa], (B, E, 8 G, 6).
+        damped: whether stiffness damping acts, with the next two arguments.
         velocity_offset: velocities are velocity_factor * q - velocity_offset, (B, N, 3) [m/s].
-        strain_offset: Green strain rates are strain_factor * E - strain_offset, (B, E, 8 G, 6) [1/s].
-        velocity_factor, strain_factor: [1/s].
+        velocity_factor: [1/s].
         project: make the tangent positive semi-definite at each point.
         tangent: whether to compute the stiffness.
         energy, gradient, stiffness: [J], [N], [N/m]; outputs.
@@ -336,7 +349,7 @@ def element_terms(
                     w[WEIGHT * 8 + g] = volume[e, group, g]
                 group_moduli = moduli[t] * group_shares[group, 0]
                 group_moduli[4] = moduli[t, 4] * group_shares[group, 1]
-                cell_strain_offset = strain_offset[t, e, 8 * group : 8 * group + 8] if damped else strain_offset[0, 0]
+                cell_memory = memory[t, e, 8 * group : 8 * group + 8] if viscous else memory[0, 0]
                 total += _add_cell(
                     w,
                     x,
@@ -345,12 +358,12 @@ def element_terms(
                     law,
                     group_moduli[0],
                     moduli[t, 1] * group_shares[group, 1],
-                    damped,
                     group_moduli,
+                    viscous,
+                    cell_memory,
+                    damped,
                     velocity_gradient,
-                    cell_strain_offset,
                     velocity_factor,
-                    strain_factor,
                     project,
                     tangent,
                 )

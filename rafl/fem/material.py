@@ -10,12 +10,12 @@ from rafl.fem.laws import LAWS
 from rafl.fem.mesh import HexMesh
 
 MASS_MODELS = ("lumped", "uniform")
-INTEGRATION_SCHEMES = ("full", "selective")
+INTEGRATION_SCHEMES = ("full", "selective", "enhanced")
 
 # Law and mass model of the paper's simulator, and those that are closer to a real specimen.
 PRESETS: dict[str, dict[str, str]] = {
     "paper": {"law": "projective", "mass": "uniform"},
-    "physical": {"law": "corotated", "mass": "lumped"},
+    "physical": {"law": "corotated", "mass": "lumped", "integration": "enhanced"},
 }
 
 
@@ -32,7 +32,7 @@ class Material:
     """A homogeneous, nearly incompressible rubber.
 
     The defaults are those of the paper's simulator. A specimen file takes the preset `physical` instead, which is
-    closer to a real specimen: `Material(mass="lumped", law="corotated")`.
+    closer to a real specimen: `Material(mass="lumped", law="corotated", integration="enhanced")`.
 
     Attributes:
         youngs_modulus: E [Pa].
@@ -43,11 +43,15 @@ class Material:
             twice the true mass of the paper's beams, and more on coarser meshes.
         law: elastic law, one of `rafl.fem.laws.LAWS`.
         integration: `full`: eight points per cell. `selective`: the lambda term sees the cell's mean
-            strain only (B-bar), so nearly incompressible cells do not lock in bending.
+            strain only (B-bar), so nearly incompressible cells do not lock in volume. `enhanced`: the law sees each
+            cell's mean deformation, and the hourglass modes have a stiffness that locks neither in volume nor in
+            bending, see `rafl.fem.hourglass`.
         mass_damping: Rayleigh coefficient alpha [1/s]; the damping force is alpha M v.
         stiffness_damping: Rayleigh coefficient beta [s]; the damping force is beta K v, with K the stiffness
             at rest. It also damps rigid rotation; use `viscosity` for large rotations.
         viscosity: Kelvin-Voigt coefficient eta [Pa s]; second Piola-Kirchhoff stress 2 eta dE/dt.
+        branch_shares, branch_times: of the Maxwell branches: shear modulus relative to mu at rest, and relaxation time
+            [s]; see `rafl.simulation.viscous_memory`. E is the relaxed modulus.
 
     Raises:
         ValueError: unknown name, or a value outside its physical range.
@@ -62,6 +66,8 @@ class Material:
     mass_damping: float = 0.0
     stiffness_damping: float = 0.0
     viscosity: float = 0.0
+    branch_shares: tuple[float, ...] = ()
+    branch_times: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for key, known in (("mass", MASS_MODELS), ("law", tuple(LAWS)), ("integration", INTEGRATION_SCHEMES)):
@@ -76,6 +82,17 @@ class Material:
             raise ValueError(
                 "expected mass_damping, stiffness_damping and viscosity of at least 0, "
                 f"got {self.mass_damping}, {self.stiffness_damping}, {self.viscosity}"
+            )
+
+        if len(self.branch_shares) != len(self.branch_times):
+            raise ValueError(
+                f"expected as many branch_shares as branch_times, got {len(self.branch_shares)} and "
+                f"{len(self.branch_times)}"
+            )
+        if min(self.branch_shares, default=0.0) < 0 or min(self.branch_times, default=1.0) <= 0:
+            raise ValueError(
+                "expected branch_shares of at least 0 and branch_times above 0, "
+                f"got {self.branch_shares} and {self.branch_times}"
             )
 
     @property

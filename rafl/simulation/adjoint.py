@@ -9,7 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rafl.fem.constitutive_state import MODULI, ConstitutiveState
+from rafl.fem.constitutive_state import DAMPING, VISCOUS, ConstitutiveState, HourglassStiffness
+from rafl.fem.hourglass import MODES
+from rafl.fem.strain import MULTIPLICITY, scatter
 from rafl.simulation.engine import Engine
 from rafl.simulation.simulator import Simulator
 from rafl.solvers.linear import Factors
@@ -24,7 +26,7 @@ class SolveContext:
     Attributes:
         simulator: the specimen.
         guess: first guess of the solution [m], (B, N, 3); None solves a static equilibrium from rest.
-        velocity_factor, strain_factor: see `rafl.fem.constitutive_state.ConstitutiveState`.
+        velocity_factor: see `rafl.fem.constitutive_state.ConstitutiveState`.
         label: name of the solve in error messages.
         factors: factors of the previous step, to be reused.
     """
@@ -32,7 +34,6 @@ class SolveContext:
     simulator: Simulator
     guess: Tensor | None
     velocity_factor: float = 1.0
-    strain_factor: float = 1.0
     label: str = "step"
     factors: Factors | None = None
 
@@ -41,7 +42,9 @@ class ImplicitSolve(torch.autograd.Function):
     """Positions x (B, N, 3) with inertia (x - target) + internal force(x) = force on the free nodes.
 
     Inputs: target (B, N, 3) [m], inertia (B, N) [kg/s^2], force (B, N, 3) [N], positions of the fixed nodes (B, F, 3)
-    [m], moduli (B, 5), and, for damping, velocity_offset (B, N, 3) and strain_offset (B, E, P, 6), or None.
+    [m], moduli (B, 5), the stiffness of the hourglass modes (3, B, U, 12, 12) for `enhanced` integration, the memory of
+    the viscous stress (B, E, Z) and the velocity offset (B, N, 3) of stiffness damping; each of the last three may be
+    None.
 
     At the solution (inertia + K) dx = inertia dtarget + dforce - ..., with K the exact tangent. So one adjoint solve
     gives all derivatives.
@@ -55,13 +58,14 @@ class ImplicitSolve(torch.autograd.Function):
         force: Tensor,
         fixed_positions: Tensor,
         moduli: Tensor,
+        hourglass: Tensor | None,
+        memory: Tensor | None,
         velocity_offset: Tensor | None,
-        strain_offset: Tensor | None,
         context: SolveContext,
     ) -> Tensor:
         """Solve for x."""
         simulator = context.simulator
-        state = _constitutive_state(moduli, velocity_offset, strain_offset, context)
+        state = _constitutive_state(moduli, hourglass, memory, velocity_offset, context)
         arrays = [_array(tensor) for tensor in (target, inertia, force, fixed_positions)]
         if context.guess is None:
             start = np.broadcast_to(simulator.mesh.vertices, arrays[2].shape).copy()
@@ -73,15 +77,15 @@ class ImplicitSolve(torch.autograd.Function):
             x = simulator.minimise(start, arrays[1], arrays[0], arrays[2], state, context.label, context.factors)
         result = torch.from_numpy(x)
         ctx.context = context
-        ctx.save_for_backward(result, target, inertia, moduli, velocity_offset, strain_offset)
+        ctx.save_for_backward(result, target, inertia, moduli, hourglass, memory, velocity_offset)
         return result
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Derivatives with respect to each input."""
-        x, target, inertia, moduli, velocity_offset, strain_offset = ctx.saved_tensors
+        x, target, inertia, moduli, hourglass, memory, velocity_offset = ctx.saved_tensors
         simulator, engine = ctx.context.simulator, ctx.context.simulator.engine
-        state = _constitutive_state(moduli, velocity_offset, strain_offset, ctx.context)
+        state = _constitutive_state(moduli, hourglass, memory, velocity_offset, ctx.context)
         q = _array(x)
         batch, nodes = q.shape[:2]
         free = engine.free_index
@@ -90,7 +94,7 @@ class ImplicitSolve(torch.autograd.Function):
         right = np.ascontiguousarray(_array(grad).reshape(batch, -1)[:, free])
         adjoint = np.zeros((batch, 3 * nodes))
         needs = ctx.needs_input_grad
-        by_fixed = by_moduli = by_velocity_offset = by_strain_offset = None
+        by_fixed = by_moduli = by_hourglass = by_memory = by_velocity_offset = None
         with engine.thread_limit(batch):
             tangents = engine.evaluate(q, state, tangent=True)[2]
             adjoint[:, free] = engine.solve_once(tangents, diagonal, right[:, None])[:, 0]
@@ -99,23 +103,52 @@ class ImplicitSolve(torch.autograd.Function):
                 by_fixed = torch.from_numpy(grad.numpy()[:, simulator.fixed] - engine.reactions(tangents, adjoint))
             if needs[4]:
                 by_moduli = torch.from_numpy(_by_moduli(engine, q, state, adjoint))
+            if needs[5] or needs[6] or (needs[4] and memory is not None):
+                strain, change = engine.strains(q, adjoint)
+                if needs[5]:
+                    by_hourglass = torch.from_numpy(_by_hourglass(engine, q, state, adjoint, strain, change))
+                if memory is not None:
+                    dual = _dual_of_viscous_strain(engine, state, change)
+                    by_memory = torch.from_numpy(dual)
+                    if by_moduli is not None:
+                        by_moduli[:, VISCOUS] = -torch.from_numpy((dual * strain).sum(axis=(1, 2)))
         by_force = torch.from_numpy(adjoint)
-        if state.damped and (needs[5] or needs[6]):
-            by_velocity_offset, by_strain_offset = _by_offsets(engine, q, state, adjoint)
+        if needs[7]:
+            by_velocity_offset = torch.from_numpy(_by_velocity_offset(engine, state, adjoint))
         return (
             inertia[..., None] * by_force if needs[0] else None,
             -(by_force * (x - target)).sum(-1) if needs[1] else None,
             by_force,
             by_fixed,
             by_moduli,
+            by_hourglass,
+            by_memory,
             by_velocity_offset,
-            by_strain_offset,
             None,
         )
 
 
-# Arguments as of `ImplicitSolve.forward`, without ctx.
+class Strains(torch.autograd.Function):
+    """Strains (B, E, Z) of `rafl.simulation.engine.Engine.strains` at positions q (B, N, 3) [m]."""
+
+    @staticmethod
+    def forward(ctx: Any, q: Tensor, engine: Engine) -> Tensor:
+        """Evaluate them."""
+        ctx.engine = engine
+        ctx.save_for_backward(q)
+        array = _array(q)
+        return torch.from_numpy(engine.strains(array, np.zeros_like(array))[0])
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
+        """Derivative by q."""
+        (q,) = ctx.saved_tensors
+        return torch.from_numpy(ctx.engine.strains_adjoint(_array(q), _array(grad))), None
+
+
+# Arguments as of the forward methods, without ctx.
 implicit_solve: Callable[..., Tensor] = ImplicitSolve.apply
+strains: Callable[..., Tensor] = Strains.apply
 
 
 def _array(tensor: Tensor) -> Array:
@@ -123,37 +156,103 @@ def _array(tensor: Tensor) -> Array:
 
 
 def _constitutive_state(
-    moduli: Tensor, velocity_offset: Tensor | None, strain_offset: Tensor | None, context: SolveContext
+    moduli: Tensor,
+    hourglass: Tensor | None,
+    memory: Tensor | None,
+    velocity_offset: Tensor | None,
+    context: SolveContext,
 ) -> ConstitutiveState:
-    velocity, strain = (None if tensor is None else _array(tensor) for tensor in (velocity_offset, strain_offset))
-    return ConstitutiveState(_array(moduli), velocity, context.velocity_factor, strain, context.strain_factor)
+    points = len(context.simulator.engine.quadrature.points.shape)
+    memories: list[Array | None] = [None, None]
+    if memory is not None:
+        whole = _array(memory)
+        own = np.ascontiguousarray(whole[..., : 6 * points]).reshape(*whole.shape[:2], points, 6)
+        memories = [own, np.ascontiguousarray(whole[..., 6 * points :])]
+    return ConstitutiveState(
+        _array(moduli),
+        memories[0],
+        None if velocity_offset is None else _array(velocity_offset),
+        context.velocity_factor,
+        None if hourglass is None else HourglassStiffness(*_array(hourglass)),
+        memories[1] if hourglass is not None else None,
+    )
 
 
 def _by_moduli(engine: Engine, q: Array, state: ConstitutiveState, adjoint: Array) -> Array:
-    """Minus adjoint . d(internal force) / d(moduli), (B, 5); the internal force is linear in each modulus."""
+    """Minus adjoint . d(internal force) / d(moduli), (B, 5), except the viscous modulus.
+
+    The internal force at the integration points is linear in each modulus.
+    """
     out = np.zeros_like(state.moduli)
-    for k in range(len(MODULI) if state.damped else 2):
+    hourglass = state.hourglass
+    if hourglass is not None:
+        none = np.zeros_like(hourglass.elastic)
+        hourglass = HourglassStiffness(none, none, none)
+    for k in (0, 1, *(DAMPING if state.velocity_offset is not None else ())):
         unit = np.zeros_like(state.moduli)
         unit[:, k] = 1.0
         single = ConstitutiveState(
-            unit, state.velocity_offset, state.velocity_factor, state.strain_offset, state.strain_factor
+            unit, None, state.velocity_offset if k in DAMPING else None, state.velocity_factor, hourglass
         )
         out[:, k] = -(adjoint * engine.evaluate(q, single, tangent=False)[1]).sum(axis=(1, 2))
     return out
 
 
-def _by_offsets(engine: Engine, q: Array, state: ConstitutiveState, adjoint: Array) -> tuple[Tensor, Tensor]:
-    """Derivatives of minus adjoint . internal force with respect to velocity_offset and strain_offset."""
+def _viscous_weights(engine: Engine) -> Array:
+    """Twice the volume of every integration point times the multiplicity of its strains, (E, 6 P)."""
+    points, shares = engine.quadrature.points, engine.quadrature.point_shares[:, 0]
+    weights = 2.0 * (points.volume * shares)[..., None] * MULTIPLICITY
+    return weights.reshape(len(weights), -1)
+
+
+def _dual_of_viscous_strain(engine: Engine, state: ConstitutiveState, change: Array) -> Array:
+    """Derivative of adjoint . viscous force by the viscous strain g E - memory, (B, E, Z); `change` is along adjoint."""
+    weights = _viscous_weights(engine)
+    dual = np.empty_like(change)
+    dual[..., : weights.shape[1]] = weights * change[..., : weights.shape[1]]
+    if state.hourglass is not None:
+        matrix = state.hourglass.viscous[:, engine.hourglass_modes.shape_index]
+        dual[..., weights.shape[1] :] = np.einsum("becd,bed->bec", matrix, change[..., weights.shape[1] :])
+    return dual
+
+
+def _by_hourglass(
+    engine: Engine, q: Array, state: ConstitutiveState, adjoint: Array, strain: Array, change: Array
+) -> Array:
+    """Minus adjoint . d(internal force) / d(stiffness of the hourglass modes), (3, B, U, 12, 12)."""
+    assert state.hourglass is not None
+    own, along = strain[..., -MODES:], change[..., -MODES:]
+    parts = [_by_shape(engine, along, own), np.zeros_like(state.hourglass.elastic), np.zeros_like(state.hourglass.elastic)]
+    if state.hourglass_memory is not None:
+        viscous_strain = state.moduli[:, VISCOUS, None, None] * own - state.hourglass_memory
+        parts[1] = _by_shape(engine, along, viscous_strain)
+    if state.velocity_offset is not None:
+        velocity = state.velocity_factor * q - state.velocity_offset
+        parts[2] = _by_shape(engine, engine.hourglass_modes.vectors(adjoint), engine.hourglass_modes.vectors(velocity))
+    return -np.stack(parts)
+
+
+def _by_shape(engine: Engine, left: Array, right: Array) -> Array:
+    """Outer products of left and right (B, E, 12), summed over the cells of each shape, (B, U, 12, 12)."""
+    index = engine.hourglass_modes.shape_index
+    out = np.zeros((len(left), int(index.max()) + 1, MODES, MODES))
+    if out.shape[1] == 1:
+        np.einsum("bec,bed->bcd", left, right, out=out[:, 0])
+    else:
+        np.add.at(out, (slice(None), index), left[..., :, None] * right[..., None, :])
+    return out
+
+
+def _by_velocity_offset(engine: Engine, state: ConstitutiveState, adjoint: Array) -> Array:
+    """Derivative of minus adjoint . internal force by the velocity offset, (B, N, 3)."""
     points, shares, hexes = engine.quadrature.points, engine.quadrature.point_shares, engine.mesh.hexes
-    eta, mu, lam = (state.moduli[:, k, None, None] * shares[:, share] for k, share in ((2, 0), (3, 0), (4, 1)))
+    mu, lam = (state.moduli[:, k, None, None] * shares[:, share] for k, share in zip(DAMPING, (0, 1), strict=True))
     slope = np.einsum("beni,epnj->bepij", adjoint[:, hexes], points.gradient)
     trace = np.trace(slope, axis1=-2, axis2=-1)
     stress = mu[..., None, None] * (slope + slope.swapaxes(-1, -2)) + (lam * trace)[..., None, None] * np.eye(3)
     force = np.einsum("ep,bepij,epnj->beni", points.volume, stress, points.gradient)
-    by_velocity_offset = torch.zeros(q.shape, dtype=torch.float64)
-    by_velocity_offset.index_add_(1, torch.from_numpy(hexes.ravel()), torch.from_numpy(force.reshape(len(q), -1, 3)))
-    F = np.einsum("beni,epnj->bepij", q[:, hexes], points.gradient)
-    strain = F.swapaxes(-1, -2) @ slope
-    strain = 0.5 * (strain + strain.swapaxes(-1, -2))
-    components = strain[..., [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]] * np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
-    return by_velocity_offset, torch.from_numpy(2.0 * (eta * points.volume)[..., None] * components)
+    if state.hourglass is not None:
+        matrix = state.hourglass.damping[:, engine.hourglass_modes.shape_index]
+        along = np.einsum("becd,bed->bec", matrix, engine.hourglass_modes.vectors(adjoint))
+        force += np.einsum("beki,ekn->beni", along.reshape(*along.shape[:2], 4, 3), engine.hourglass_modes.gamma)
+    return scatter(force, hexes, adjoint.shape[1])

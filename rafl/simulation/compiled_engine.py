@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.fem.constitutive_state import ConstitutiveState
-from rafl.fem.elements import element_terms, multiply
-from rafl.fem.laws import LAWS
+from rafl.fem.elements import multiply
+from rafl.fem.hourglass import HourglassModes
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule
+from rafl.simulation.compiled_elements import CompiledElements, EnhancedElements, PointElements
 from rafl.solvers.choose import choose_linear_solver
 from rafl.solvers.linear import Factors, LinearSolver
 
@@ -28,7 +29,7 @@ class CompiledEngine:
     Args:
         mesh: the rest shape.
         law: name of the elastic law.
-        integration: `full`, or `selective`: lambda at the mean strain of each cell only (B-bar).
+        integration: one of `rafl.fem.material.INTEGRATION_SCHEMES`.
         fixed: indices of the fixed nodes, (F).
     """
 
@@ -36,13 +37,11 @@ class CompiledEngine:
         self.mesh = mesh
         self.fixed = fixed
         self._reused: Factors | None = None  # storage that repeated calls of `solve_once` share
-        self.law = list(LAWS).index(law)
         self.quadrature = QuadratureRule.from_scheme(mesh, integration)
-        cells, groups = len(mesh.hexes), len(self.quadrature.group_shares)
-        gradient = self.quadrature.points.gradient.reshape(cells, groups, 8, 8, 3)  # (.., point, node, component)
-        self._gradients_by_point = np.ascontiguousarray(gradient.transpose(0, 1, 3, 4, 2)).reshape(cells, groups, 192)
-        self._gradients_by_node = np.ascontiguousarray(gradient.transpose(0, 1, 2, 4, 3)).reshape(cells, groups, 192)
-        self._volume = self.quadrature.points.volume.reshape(cells, groups, 8)
+        self.hourglass_modes = HourglassModes(mesh)
+        self._elements: CompiledElements = (
+            EnhancedElements(self.hourglass_modes, law) if integration == "enhanced" else PointElements(mesh, law, self.quadrature)
+        )
         self._cells_at_fixed = np.flatnonzero(np.isin(mesh.hexes, fixed).any(axis=1))
 
     @contextmanager
@@ -74,31 +73,18 @@ class CompiledEngine:
         The tangents are opaque: pass them to `factor`, `multiply`, `reactions` or `solve_once`. They are exact, or
         positive semi-definite if `project`.
         """
-        batch = len(q)
-        energy, gradient = np.empty(batch), np.empty_like(q)
-        stiffness = np.empty((batch if tangent else 0, len(self.mesh.hexes), 6, 8, 8))
-        unused = np.zeros((1, 1, 1, 1))
-        element_terms(
-            q,
-            self.mesh.hexes,
-            self._gradients_by_point,
-            self._gradients_by_node,
-            self._volume,
-            self.quadrature.group_shares,
-            self.law,
-            state.moduli,
-            state.damped,
-            unused[0] if state.velocity_offset is None else state.velocity_offset,
-            unused if state.strain_offset is None else state.strain_offset,
-            state.velocity_factor,
-            state.strain_factor,
-            project,
-            tangent,
-            energy,
-            gradient,
-            stiffness,
-        )
-        return energy, gradient, stiffness
+        return self._elements.evaluate(q, state, tangent=tangent, project=project)
+
+    def strains(self, q: Array, direction: Array) -> tuple[Array, Array]:
+        """Strains (B, E, Z) that viscous stress depends on, and their change along a direction, both (B, N, 3) [m].
+
+        They are the Green strains at the integration points and, for `enhanced` integration, the hourglass vectors [m].
+        """
+        return self._elements.strains(q, direction)
+
+    def strains_adjoint(self, q: Array, by_strain: Array) -> Array:
+        """Derivative by q (B, N, 3) of the sum of by_strain (B, E, Z) times the strains, (B, N, 3)."""
+        return self._elements.strains_adjoint(q, by_strain)
 
     def multiply(self, tangents: Array, x: Array) -> Array:
         """Tangent times x, both (B, N, 3), on all nodes, including the fixed ones."""

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.fem.constitutive_state import ConstitutiveState
+from rafl.fem.hourglass import HourglassModes
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule
 from rafl.solvers.linear import Factors
@@ -19,6 +20,7 @@ class Engine(Protocol):
 
     mesh: HexMesh
     quadrature: QuadratureRule
+    hourglass_modes: HourglassModes
 
     @property
     def free_index(self) -> Array:
@@ -36,6 +38,15 @@ class Engine(Protocol):
         The tangents are opaque: pass them to `factor`, `multiply`, `reactions` or `solve_once`. They are exact, or
         positive semi-definite if `project`.
         """
+
+    def strains(self, q: Array, direction: Array) -> tuple[Array, Array]:
+        """Strains (B, E, Z) that viscous stress depends on, and their change along a direction, both (B, N, 3) [m].
+
+        They are the Green strains at the integration points and, for `enhanced` integration, the hourglass vectors [m].
+        """
+
+    def strains_adjoint(self, q: Array, by_strain: Array) -> Array:
+        """Derivative by q (B, N, 3) of the sum of by_strain (B, E, Z) times the strains, (B, N, 3)."""
 
     def multiply(self, tangents: Any, x: Array) -> Array:
         """Tangent times x, both (B, N, 3), on all nodes, including the fixed ones."""

@@ -14,6 +14,8 @@ from rafl.fem.material import Material, lame
 class Parameters:
     """Material and gravity as tensors: scalars, or one number per trajectory (B); gravity (3) or (B, 3).
 
+    Shares and times of K branches are (K) or (B, K).
+
     Units are those of `rafl.fem.material.Material`; gravity in m/s^2.
     """
 
@@ -23,6 +25,8 @@ class Parameters:
     mass_damping: Tensor
     stiffness_damping: Tensor
     viscosity: Tensor
+    branch_shares: Tensor
+    branch_times: Tensor
     gravity: Tensor
 
     @classmethod
@@ -32,17 +36,34 @@ class Parameters:
         return cls(**{key: torch.as_tensor(value, dtype=torch.float64) for key, value in values.items()})
 
     @property
-    def damped(self) -> bool:
-        """Whether stiffness damping or viscosity is non-zero or requires a gradient."""
-        return any(
-            value.requires_grad or bool((value.detach() != 0.0).any())
-            for value in (self.stiffness_damping, self.viscosity)
-        )
+    def viscous(self) -> bool:
+        """Whether there are branches, or viscosity is non-zero or requires a gradient."""
+        return self.branch_times.shape[-1] > 0 or _acts(self.viscosity)
+
+    @property
+    def stiffness_damped(self) -> bool:
+        """Whether stiffness damping is non-zero or requires a gradient."""
+        return _acts(self.stiffness_damping)
+
+    def rest_lame(self, law: str, batch: int) -> tuple[Tensor, Tensor]:
+        """Lame parameters mu and lambda of the law's linearisation at rest [Pa], (B) each."""
+        mu, lam = LAWS[law].rest_lame(*lame(self.youngs_modulus, self.poissons_ratio))
+        return mu.expand(batch), lam.expand(batch)
+
+    def branches(self, law: str, batch: int) -> tuple[Tensor, Tensor]:
+        """Moduli [Pa] and relaxation times [s] of the branches, (B, K) each."""
+        mu, _ = self.rest_lame(law, batch)
+        shape = (batch, self.branch_times.shape[-1])
+        return mu[:, None] * self.branch_shares.expand(shape), self.branch_times.expand(shape)
 
     def moduli(self, law: str, batch: int) -> Tensor:
-        """Columns of `rafl.fem.constitutive_state.MODULI`, (B, 5)."""
+        """Columns of `rafl.fem.constitutive_state.MODULI`, (B, 5), without a viscous modulus."""
         mu, lam = lame(self.youngs_modulus, self.poissons_ratio)
-        rest_mu, rest_lam = LAWS[law].rest_lame(mu, lam)
+        rest_mu, rest_lam = self.rest_lame(law, batch)
         beta = self.stiffness_damping
-        columns = (mu, lam, self.viscosity, beta * rest_mu, beta * rest_lam)
+        columns = (mu, lam, torch.zeros_like(mu), beta * rest_mu, beta * rest_lam)
         return torch.stack([column.expand(batch) for column in columns], dim=-1)
+
+
+def _acts(value: Tensor) -> bool:
+    return value.requires_grad or bool((value.detach() != 0.0).any())

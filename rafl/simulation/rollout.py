@@ -7,10 +7,13 @@ import torch
 from torch import Tensor
 
 from rafl.common.errors import SimulationError
-from rafl.simulation.adjoint import SolveContext, implicit_solve
+from rafl.fem.constitutive_state import VISCOUS
+from rafl.simulation.adjoint import SolveContext, implicit_solve, strains
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.simulator import Simulator
-from rafl.simulation.time_integration import INTEGRATORS, ImplicitEuler, State, StepProblem, green_strain
+from rafl.simulation.time_integration import INTEGRATORS, ImplicitEuler, State, StepProblem
+from rafl.simulation.viscous_memory import ViscousMemory
+from rafl.solvers.linear import Factors
 
 ResidualForce = Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -49,7 +52,8 @@ class _BodyBatch:
 
     simulator: Simulator
     parameters: Parameters
-    moduli: Tensor  # (B, 5)
+    moduli: Tensor  # (B, 5), without a viscous modulus
+    hourglass: Tensor | None  # (3, B, U, 12, 12), for `enhanced` integration
     mass: Tensor  # [kg], (B, N)
     weight: Tensor  # [N], (B, N, 3)
 
@@ -60,21 +64,48 @@ class _BodyBatch:
         own_mass = values.density.expand(batch)[:, None] * torch.from_numpy(simulator.node_volume)
         weight = own_mass[..., None] * values.gravity.expand(batch, 3)[:, None]
         moduli = values.moduli(simulator.material.law, batch)
-        return cls(simulator, values, moduli, own_mass + added_mass, weight)
+        hourglass = simulator.hourglass_stiffness(values, batch)
+        return cls(simulator, values, moduli, hourglass, own_mass + added_mass, weight)
 
-    def damping_offsets(self, state: State, problem: StepProblem) -> tuple[Tensor, Tensor] | tuple[None, None]:
-        """Velocity and strain offsets of `rafl.fem.constitutive_state.ConstitutiveState`, or None without damping."""
-        if not self.parameters.damped:
-            return None, None
-        strain, strain_rate = self._strains(state)
-        return problem.velocity_offset, problem.strain_factor * strain + problem.strain_rate_weight * strain_rate
+    def initial_memory(self, state: State) -> ViscousMemory | None:
+        """Memory of bodies that have long been at rest at their positions, or None without viscosity."""
+        if not self.parameters.viscous:
+            return None
+        batch = len(state.q)
+        branches = self.parameters.branches(self.simulator.material.law, batch)
+        viscosity = self.parameters.viscosity.expand(batch)
+        return ViscousMemory(viscosity, *branches, strains(state.q, self.simulator.engine))
 
-    def _strains(self, state: State) -> tuple[Tensor, Tensor]:
-        mesh, points = self.simulator.mesh, self.simulator.engine.quadrature.points
-        return green_strain(state.q, state.v, torch.from_numpy(mesh.hexes), torch.from_numpy(points.gradient))
+    def solve(
+        self,
+        problem: StepProblem,
+        force: Tensor,
+        fixed_positions: Tensor,
+        memory: ViscousMemory | None,
+        duration: float,
+        label: str,
+        factors: Factors | None = None,
+    ) -> tuple[Tensor, ViscousMemory | None]:
+        """Solution of a step's equation, `duration` [s] after the latest one, and the memory after it."""
+        simulator, moduli, terms = self.simulator, self.moduli, None
+        if memory is not None:
+            modulus, terms = memory.stress_terms(duration)
+            moduli = torch.cat([moduli[:, :VISCOUS], modulus[:, None], moduli[:, VISCOUS + 1 :]], dim=1)
+        offset = problem.velocity_offset if self.parameters.stiffness_damped else None
+        context = SolveContext(simulator, problem.guess, problem.velocity_factor, label, factors)
+        x = implicit_solve(
+            problem.target, problem.inertia, force, fixed_positions, moduli, self.hourglass, terms, offset, context
+        )
+        return x, None if memory is None else memory.after(strains(x, simulator.engine), duration)
 
     def initial_acceleration(
-        self, state: State, force: Tensor, alpha: Tensor, fixed_positions: Tensor, duration: float
+        self,
+        state: State,
+        force: Tensor,
+        alpha: Tensor,
+        fixed_positions: Tensor,
+        memory: ViscousMemory | None,
+        duration: float,
     ) -> Tensor:
         """Initial acceleration of the free nodes under `force`, gravity included [m/s^2], (B, N, 3).
 
@@ -83,11 +114,7 @@ class _BodyBatch:
         farther than a whole step could correct.
         """
         problem = ImplicitEuler().problem(state, self.mass, alpha, duration)
-        offsets = self.damping_offsets(state, problem)
-        context = SolveContext(
-            self.simulator, problem.guess, problem.velocity_factor, problem.strain_factor, "initial acceleration"
-        )
-        x = implicit_solve(problem.target, problem.inertia, force, fixed_positions, self.moduli, *offsets, context)
+        x, _ = self.solve(problem, force, fixed_positions, memory, duration, "initial acceleration")
         free = torch.ones(state.q.shape[1], 1, dtype=torch.float64)
         free[torch.from_numpy(self.simulator.fixed)] = 0.0
         return free * ((x - state.q) / duration - state.v) / duration
@@ -129,6 +156,8 @@ def rollout(
     factors = simulator.engine.allocate(len(start.q))
     fixed = torch.from_numpy(simulator.fixed)
     state = State(start.q, start.v, torch.zeros_like(start.q))
+    memory = body.initial_memory(state)
+    duration = integrator.fraction * h  # from the latest solution to the next
     positions, forces = [start.q], []
     begin = start.q[:, fixed]
     for step in range(steps):
@@ -141,8 +170,8 @@ def rollout(
         if step == 0 and integrator.uses_acceleration:
             share = FIRST_ACCELERATION_FRACTION / simulator.substeps
             fixed_positions = begin if clamp is None else (1.0 - share) * begin + share * clamp[0]
-            duration = FIRST_ACCELERATION_FRACTION * h
-            acceleration = body.initial_acceleration(state, force, alpha, fixed_positions, duration)
+            begin_duration = FIRST_ACCELERATION_FRACTION * h
+            acceleration = body.initial_acceleration(state, force, alpha, fixed_positions, memory, begin_duration)
             state = State(state.q, state.v, acceleration)
         for substep in range(simulator.substeps):
             problem = integrator.problem(state, body.mass, alpha, h)
@@ -150,17 +179,11 @@ def rollout(
             if clamp is not None:
                 share = (substep + integrator.fraction) / simulator.substeps
                 fixed_positions = (1.0 - share) * begin + share * clamp[step]
-            offsets = body.damping_offsets(state, problem)
-            context = SolveContext(
-                simulator, problem.guess, problem.velocity_factor, problem.strain_factor, f"step {step + 1}", factors
-            )
             try:
-                x = implicit_solve(
-                    problem.target, problem.inertia, force, fixed_positions, body.moduli, *offsets, context
-                )
+                x, memory = body.solve(problem, force, fixed_positions, memory, duration, f"step {step + 1}", factors)
             except SimulationError as error:
                 raise SimulationError(f"{error} [trajectories: {', '.join(start.names)}]") from None
-            state = integrator.advance(state, x, h)
+            state, duration = integrator.advance(state, x, h), h
         positions.append(state.q)
     return torch.stack(positions), torch.stack(forces) if forces else start.q.new_zeros(0)
 
@@ -191,4 +214,6 @@ def equilibrium(
     context = SolveContext(simulator, None, label=label)
     no_inertia = force.new_zeros(batch, nodes)
     target = torch.zeros_like(force)
-    return implicit_solve(target, no_inertia, force + body.weight, fixed_positions, body.moduli, None, None, context)
+    return implicit_solve(
+        target, no_inertia, force + body.weight, fixed_positions, body.moduli, body.hourglass, None, None, context
+    )

@@ -5,10 +5,12 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from rafl.common.errors import SimulationError
-from rafl.fem.constitutive_state import ConstitutiveState
+from rafl.fem.constitutive_state import ConstitutiveState, HourglassStiffness
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.compiled_engine import CompiledEngine
@@ -111,9 +113,27 @@ class Simulator:
         """Material and gravity as tensors, some replaced by name, for `rafl.simulation.rollout`."""
         return Parameters.of(self.material, self.gravity, **replacements)
 
+    def hourglass_stiffness(self, parameters: Parameters, batch: int) -> Tensor | None:
+        """Stiffness of the hourglass modes for `enhanced` integration, else None.
+
+        Elastic [N/m], viscous per Pa [m] and of stiffness damping [N s/m], (3, B, U, 12, 12); see
+        `rafl.fem.constitutive_state.HourglassStiffness`. Differentiable by the parameters.
+        """
+        if self.material.integration != "enhanced":
+            return None
+        mu, lam = parameters.rest_lame(self.material.law, batch)
+        elastic, viscous = self.engine.hourglass_modes.stiffness(mu, lam)
+        beta = parameters.stiffness_damping.expand(batch)[:, None, None, None]
+        return torch.stack([elastic, viscous, beta * elastic])
+
     def constitutive_state(self, batch: int) -> ConstitutiveState:
         """Elastic moduli of the material, without damping, for a batch."""
-        return ConstitutiveState(self.parameters().moduli(self.material.law, batch).numpy())
+        parameters = self.parameters()
+        hourglass = self.hourglass_stiffness(parameters, batch)
+        return ConstitutiveState(
+            parameters.moduli(self.material.law, batch).numpy(),
+            hourglass=None if hourglass is None else HourglassStiffness(*hourglass.numpy()),
+        )
 
     def elastic_gradient(self, q: Array) -> Array:
         """Derivative of the elastic energy with respect to q [N], (B, N, 3)."""

@@ -25,8 +25,6 @@ class StepProblem:
         inertia: [kg/s^2], (B, N).
         velocity_offset, velocity_factor: velocities at x are velocity_factor * x - velocity_offset, (B, N, 3) [m/s],
             [1/s].
-        strain_factor, strain_rate_weight: Green strain rates at x are
-            strain_factor * (E(x) - E(q)) - strain_rate_weight * dE(q)/dt, [1/s], [].
         guess: first guess of x [m], (B, N, 3), detached.
     """
 
@@ -34,8 +32,6 @@ class StepProblem:
     inertia: Tensor
     velocity_offset: Tensor
     velocity_factor: float
-    strain_factor: float
-    strain_rate_weight: float
     guess: Tensor
 
 
@@ -67,7 +63,7 @@ class ImplicitEuler:
         inertia = mass * (1.0 + damping) / h**2
         target = state.q + h * state.v / (1.0 + damping)[..., None]
         guess = (state.q + h * state.v + h**2 * state.a).detach()
-        return StepProblem(target, inertia, state.q / h, 1.0 / h, 1.0 / h, 0.0, guess)
+        return StepProblem(target, inertia, state.q / h, 1.0 / h, guess)
 
     def advance(self, state: State, x: Tensor, h: float) -> State:
         """The state after the step; its acceleration is only used for the next guess."""
@@ -81,8 +77,6 @@ class GeneralisedAlpha:
     Args:
         rho_infinity: spectral radius at infinite frequency, the factor by which a step scales the highest frequencies:
             1 keeps them, 0 removes them. Low frequencies are hardly damped.
-
-    The strain rate for viscosity is that of the trapezoidal rule.
     """
 
     uses_acceleration = True
@@ -108,7 +102,7 @@ class GeneralisedAlpha:
         weight = (damping_factor / (inertia_factor + damping_factor))[..., None]
         target = (1.0 - weight) * inertia_target + weight * velocity_offset / velocity_factor
         guess = (q + theta * (h * v + 0.5 * h**2 * a)).detach()
-        return StepProblem(target, inertia, velocity_offset, velocity_factor, 2.0 / (theta * h), 1.0, guess)
+        return StepProblem(target, inertia, velocity_offset, velocity_factor, guess)
 
     def advance(self, state: State, x: Tensor, h: float) -> State:
         """The state after the step."""
@@ -123,15 +117,3 @@ INTEGRATORS: dict[str, Integrator] = {
     "generalised-alpha": GeneralisedAlpha(0.5),
 }
 
-
-def green_strain(q: Tensor, v: Tensor, hexes: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-    """Green strain E and its rate [1/s] at the integration points, components 00 11 22 01 12 02, (B, E, P, 6).
-
-    q [m] and v [m/s] (B, N, 3); hexes (E, 8); shape function gradients [1/m] (E, P, 8, 3).
-    """
-    F, F_rate = (torch.einsum("beni,egnj->begij", x[:, hexes], gradient) for x in (q, v))
-    identity = torch.eye(3, dtype=q.dtype)
-    strain = 0.5 * (F.mT @ F - identity)
-    strain_rate = 0.5 * (F.mT @ F_rate + F_rate.mT @ F)
-    first, second = [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]
-    return strain[..., first, second], strain_rate[..., first, second]
