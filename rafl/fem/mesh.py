@@ -86,6 +86,38 @@ class HexMesh:
         """The mesh scaled by `factors` (3) along x, y, z."""
         return HexMesh(self.vertices * np.asarray(factors, dtype=float), self.hexes)
 
+    def split_layer(self, nodes: NDArray[np.int64], fraction: float) -> "HexMesh":
+        """The mesh with every cell that has a side at `nodes` cut in two, parallel to this side.
+
+        `fraction` is the share of the cell between the side and the cut. Vertices run z fastest, then y, then x.
+
+        Raises:
+            ValueError: fraction not between 0 and 1, or a cell that is not cut shares an edge that is.
+        """
+        if not 0.0 < fraction < 1.0:
+            raise ValueError(f"expected a fraction between 0 and 1, got {fraction}")
+        held = np.isin(self.hexes, nodes)
+        hexes, cut = self.hexes.copy(), dict[tuple[int, int], int]()
+        vertices, far_parts = list(self.vertices), []
+        for name, side in CELL_SIDES.items():
+            offset = {"x": 4, "y": 2, "z": 1}[name[0]] * (1 if name.endswith("min") else -1)
+            opposite = np.array(side) + offset
+            for e in np.flatnonzero(held[:, side].all(axis=1) & ~held[:, opposite].any(axis=1)):
+                far = self.hexes[e].copy()
+                for a, b in zip(side, opposite, strict=True):
+                    edge = (int(self.hexes[e, a]), int(self.hexes[e, b]))
+                    if edge not in cut:
+                        cut[edge] = len(vertices)
+                        vertices.append((1.0 - fraction) * self.vertices[edge[0]] + fraction * self.vertices[edge[1]])
+                    hexes[e, b] = far[a] = cut[edge]
+                far_parts.append(far)
+        result = HexMesh(np.array(vertices), np.concatenate([hexes, np.array(far_parts, dtype=np.int64).reshape(-1, 8)]))
+        if {tuple(sorted(edge)) for edge in cut} & {tuple(edge) for edge in result.edges.tolist()}:
+            raise ValueError("expected every cell along an edge to be cut at the nodes alike, found one that is not")
+        digits = np.round(result.vertices / np.ptp(result.vertices, axis=0).max(), 9)
+        order = np.lexsort(digits.T[::-1])
+        return HexMesh(result.vertices[order], np.argsort(order)[result.hexes])
+
     @cached_property
     def quadrature(self) -> QuadraturePoints:
         """The 8 Gauss points at (0.5 -+ 0.5/sqrt 3) of the unit cell, in node order.

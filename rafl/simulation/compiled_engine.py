@@ -36,6 +36,7 @@ class CompiledEngine:
     def __init__(self, mesh: HexMesh, law: str, integration: str, fixed: NDArray[np.int64]) -> None:
         self.mesh = mesh
         self.fixed = fixed
+        self.integration = integration
         self._reused: Factors | None = None  # storage that repeated calls of `solve_once` share
         self.quadrature = QuadratureRule.from_scheme(mesh, integration)
         self.hourglass_modes = HourglassModes(mesh)

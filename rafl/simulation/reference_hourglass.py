@@ -25,7 +25,10 @@ def local_vectors(x: Tensor, gradient: Tensor, gamma: Tensor, rotation: Tensor) 
     for _ in range(2):
         S = R.T @ F
         axial = torch.stack([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]])
-        turn = _cross_matrix(torch.linalg.solve(torch.trace(S) * identity - S, axial))
+        a, b, c = (torch.trace(S) * identity - S).T  # columns
+        b_c = torch.linalg.cross(b, c)
+        solution = torch.stack([b_c @ axial, torch.linalg.cross(c, a) @ axial, torch.linalg.cross(a, b) @ axial])
+        turn = _cross_matrix(solution / (a @ b_c))
         R = R @ (identity + turn + 0.5 * turn @ turn)
     return (gamma @ x @ R).reshape(MODES)
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rafl.fem.constitutive_state import ConstitutiveState
+from rafl.fem.constitutive_state import ConstitutiveState, HourglassStiffness
 from rafl.fem.laws import LAWS
-from rafl.fem.material import Material
+from rafl.fem.material import INTEGRATION_SCHEMES, Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.compiled_engine import CompiledEngine
 from rafl.simulation.reference_engine import ReferenceEngine
@@ -35,19 +35,39 @@ def engines(law: str, integration: str) -> tuple[CompiledEngine, ReferenceEngine
     return CompiledEngine(MESH, law, integration, FIXED), ReferenceEngine(MESH, law, integration, FIXED)
 
 
-@pytest.mark.parametrize(("law", "integration", "damped"), list(product(LAWS, ("full", "selective"), (False, True))))
+def constitutive(
+    engine: CompiledEngine, moduli: np.ndarray, damped: bool, random: np.random.Generator
+) -> ConstitutiveState:
+    """State with these values of mu and lambda (B, 2) and, if `damped`, viscosity and stiffness damping."""
+    batch, cells, points = len(moduli), len(engine.mesh.hexes), len(engine.quadrature.points.shape)
+    own = np.zeros((batch, 5))
+    own[:, :2] = moduli
+    enhanced = engine.integration == "enhanced"
+    hourglass = None
+    if enhanced:
+        elastic, viscous = (x.numpy() for x in engine.hourglass_modes.stiffness(*torch.from_numpy(moduli.T)))
+        hourglass = HourglassStiffness(elastic, viscous, 3e-3 * elastic)
+    if not damped:
+        return ConstitutiveState(own, hourglass=hourglass)
+    own[:, 2:] = [2400.0, 300.0, 900.0]
+    return ConstitutiveState(
+        own,
+        random.normal(0, 20.0, (batch, cells, points, 6)),
+        random.normal(0, 0.3, (batch, len(engine.mesh.vertices), 3)),
+        100.0,
+        hourglass,
+        random.normal(0, 0.2, (batch, cells, 12)) if enhanced else None,
+    )
+
+
+@pytest.mark.parametrize(("law", "integration", "damped"), list(product(LAWS, INTEGRATION_SCHEMES, (False, True))))
 def test_compiled_and_reference_engines_agree(
     law: str, integration: str, damped: bool, random: np.random.Generator
 ) -> None:
     q = states(random)
-    moduli = np.tile([7e4, 6e5, 0.0, 0.0, 0.0], (len(q), 1)) * np.linspace(0.5, 1.5, len(q))[:, None]
+    moduli = np.tile([7e4, 6e5], (len(q), 1)) * np.linspace(0.5, 1.5, len(q))[:, None]
     compiled, reference = engines(law, integration)
-    state = ConstitutiveState(moduli)
-    if damped:
-        moduli[:, 2:] = [20.0, 300.0, 900.0]
-        points = compiled.quadrature.points.volume.shape
-        strain = random.normal(0, 1.0, (len(q), *points, 6))
-        state = ConstitutiveState(moduli, random.normal(0, 0.3, q.shape), 100.0, strain, 120.0)
+    state = constitutive(compiled, moduli, damped, random)
     x = random.normal(size=q.shape)
     for project in (False, True):
         compiled_values = compiled.evaluate(q, state, tangent=True, project=project)
@@ -62,12 +82,10 @@ def test_compiled_and_reference_engines_agree(
 
 
 def test_gradient_and_tangent_by_finite_differences(random: np.random.Generator) -> None:
-    for law, integration in product(LAWS, ("full", "selective")):
+    for law, integration in product(LAWS, INTEGRATION_SCHEMES):
         engine = CompiledEngine(MESH, law, integration, FIXED)
         q = states(random)[1:3]
-        points = engine.quadrature.points.volume.shape
-        damping = (random.normal(0, 0.3, q.shape), 100.0, random.normal(0, 1.0, (2, *points, 6)), 120.0)
-        state = ConstitutiveState(np.tile([7e4, 6e5, 20.0, 300.0, 900.0], (2, 1)), *damping)
+        state = constitutive(engine, np.tile([7e4, 6e5], (2, 1)), True, random)
         direction = random.normal(size=q.shape)
         h = 1e-8
         forward, backward = (engine.evaluate(q + sign * h * direction, state, tangent=False) for sign in (1, -1))
@@ -79,10 +97,41 @@ def test_gradient_and_tangent_by_finite_differences(random: np.random.Generator)
         assert np.abs(tangent_product - gradient_slope).max() < 1e-6 * np.abs(gradient_slope).max()
 
 
+@pytest.mark.parametrize("integration", INTEGRATION_SCHEMES)
+def test_strains_of_both_engines_agree(integration: str, random: np.random.Generator) -> None:
+    """Strains, their change along a direction by finite differences, and the adjoint as the transpose of the change."""
+    compiled, reference = engines("corotated", integration)
+    q = states(random)[:3]
+    direction = random.normal(size=q.shape)
+    strain, change = compiled.strains(q, direction)
+    for found, expected in zip((strain, change), reference.strains(q, direction), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-11)
+    h = 1e-7
+    forward, backward = (compiled.strains(q + sign * h * direction, direction)[0] for sign in (1, -1))
+    np.testing.assert_allclose(change, (forward - backward) / (2 * h), rtol=1e-5, atol=1e-6)
+    weights = random.normal(size=strain.shape)
+    for engine in (compiled, reference):
+        adjoint = engine.strains_adjoint(q, weights)
+        assert (adjoint * direction).sum() == pytest.approx((weights * change).sum(), rel=1e-10)
+
+
+@pytest.mark.parametrize("integration", ["full", "enhanced"])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "generalised-alpha"])
-def test_trajectories_and_gradients_of_both_engines_agree(integrator: str, random: np.random.Generator) -> None:
+def test_trajectories_and_gradients_of_both_engines_agree(
+    integrator: str, integration: str, random: np.random.Generator
+) -> None:
     """On a damped batch: positions to a relative 1e-10, gradients to a relative 1e-8."""
-    material = Material(1.5e5, 0.45, mass="lumped", law="corotated", viscosity=20.0, stiffness_damping=2e-3)
+    material = Material(
+        1.5e5,
+        0.45,
+        mass="lumped",
+        law="corotated",
+        integration=integration,
+        viscosity=20.0,
+        stiffness_damping=2e-3,
+        branch_shares=(0.1, 0.2),
+        branch_times=(0.02, 0.3),
+    )
     kick = torch.tensor(random.normal(0, 0.1, (2, *MESH.vertices.shape)))
     found = []
     for arithmetic in ("compiled", "plain"):

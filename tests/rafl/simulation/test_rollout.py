@@ -55,6 +55,8 @@ SCALE = {
     "mass_damping": 1.0,
     "stiffness_damping": 1e-2,
     "viscosity": 100.0,
+    "branch_shares": 1.0,
+    "branch_times": 0.1,
     "clamp": 1e-2,
     "added_mass": 1e-3,
 }
@@ -73,7 +75,13 @@ def inputs(q: np.ndarray, damped: bool, random: np.random.Generator, steps: int)
         "added_mass": random.uniform(0, 1e-3, q.shape[:2]),
     }
     if damped:
-        values |= {"mass_damping": np.array(2.0), "stiffness_damping": np.array(3e-3), "viscosity": np.array(15.0)}
+        values |= {
+            "mass_damping": np.array(2.0),
+            "stiffness_damping": np.array(3e-3),
+            "viscosity": np.array(15.0),
+            "branch_shares": np.array([0.2, 0.1]),
+            "branch_times": np.array([[0.005, 0.08], [0.01, 0.3]]),
+        }
     return {key: torch.tensor(value / SCALE[key], dtype=torch.float64) for key, value in values.items()}
 
 
@@ -86,18 +94,23 @@ def simulate(simulator: Simulator, scaled: dict[str, Tensor], steps: int) -> Ten
 
 @pytest.mark.parametrize("name", ["rest", "repeated stretches", "shaken", "turned", "near inversion"])
 @pytest.mark.parametrize(
-    ("integrator", "law", "damped"),
+    ("integrator", "law", "integration", "damped"),
     [
-        ("implicit-euler", "projective", False),
-        ("implicit-euler", "corotated", True),
-        ("generalised-alpha", "neo-hookean", False),
-        ("generalised-alpha", "projective", True),
+        ("implicit-euler", "projective", "full", False),
+        ("implicit-euler", "corotated", "full", True),
+        ("implicit-euler", "neo-hookean", "enhanced", True),
+        ("generalised-alpha", "neo-hookean", "full", False),
+        ("generalised-alpha", "projective", "full", True),
+        ("generalised-alpha", "corotated", "enhanced", False),
+        ("generalised-alpha", "corotated", "enhanced", True),
     ],
 )
-def test_gradients(name: str, integrator: str, law: str, damped: bool, random: np.random.Generator) -> None:
-    """With respect to initial state, forces, masses, material, gravity, damping and motion of the clamp."""
-    steps = 2
-    simulator = simulator_of(integrator, law=law)
+def test_gradients(
+    name: str, integrator: str, law: str, integration: str, damped: bool, random: np.random.Generator
+) -> None:
+    """With respect to initial state, forces, masses, material, gravity, damping, branches and motion of the clamp."""
+    steps = 3
+    simulator = simulator_of(integrator, law=law, integration=integration)
     scaled = inputs(state(name, random), damped, random, steps)
     keys = list(scaled)
     weights = torch.tensor(random.normal(size=(steps, 2, len(MESH.vertices), 3)))
@@ -109,9 +122,9 @@ def test_gradients(name: str, integrator: str, law: str, damped: bool, random: n
     assert torch.autograd.gradcheck(loss, leaves, eps=1e-6, atol=1e-4, rtol=1e-4, fast_mode=True)
 
 
-@pytest.mark.parametrize("law", LAWS)
-def test_gradients_of_the_equilibrium(law: str, random: np.random.Generator) -> None:
-    simulator = simulator_of(law=law)
+@pytest.mark.parametrize(("law", "integration"), [*((law, "full") for law in LAWS), ("corotated", "enhanced")])
+def test_gradients_of_the_equilibrium(law: str, integration: str, random: np.random.Generator) -> None:
+    simulator = simulator_of(law=law, integration=integration)
     force = torch.tensor(random.normal(0, 0.2, (2, len(MESH.vertices), 3)))
     modulus = torch.tensor([10.0, 12.0], dtype=torch.float64)
     ratio, density, gravity = (torch.tensor(x, dtype=torch.float64) for x in (4.0, 1.07, [0.1, 0.2, -0.98]))
@@ -169,7 +182,7 @@ def test_the_adjoint_is_the_transpose_of_the_derivative(integrator: str, random:
     if method.uses_acceleration:
         short, body = FIRST_ACCELERATION_FRACTION * h, _BodyBatch.of(simulator, None, zeros.expand(2, 12))
         first = body.initial_acceleration(
-            State(q, v, torch.zeros_like(q)), force + body.weight, zeros, q[:, fixed], short
+            State(q, v, torch.zeros_like(q)), force + body.weight, zeros, q[:, fixed], None, short
         )
         first[:, fixed] = -v[:, fixed] / short
         x = solution_change(INTEGRATOR_OF["implicit-euler"], change, q + short * v + short**2 * first, short)
