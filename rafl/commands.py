@@ -132,10 +132,15 @@ def _describe(model: FittedModel) -> str:
         return f"trained a supervised residual network for meshes of {model.network.nodes} vertices"
     parts = [] if model.field is None else ["trained a residual acceleration field"]
     if model.material is not None:
-        e, nu = model.material["youngs_modulus"], model.material["poissons_ratio"]
+        e, nu, viscosity, shares = (
+            torch.as_tensor(model.material.get(key, ()))
+            for key in ("youngs_modulus", "poissons_ratio", "viscosity", "branch_shares")
+        )
         identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
-        if "viscosity" in model.material:
-            identified += f", viscosity = {model.material['viscosity']:.0f} Pa s"
+        if viscosity.numel():
+            identified += f", viscosity = {viscosity:.0f} Pa s"
+        if shares.numel():
+            identified += f", branches of {', '.join(f'{share:.3f}' for share in shares.tolist())} mu"
         parts.append(identified)
     integration = f", time integration {model.time_integration['integrator']}" if model.time_integration else ""
     return " on ".join(parts) + integration

@@ -113,7 +113,8 @@ def _write(file: h5py.File, dataset: Dataset, recipe: str) -> None:
     _write_array(file, "mesh/vertices", simulator.mesh.vertices)
     _write_array(file, "mesh/hexes", simulator.mesh.hexes)
     _write_array(file, "mesh/fixed", simulator.fixed)
-    file.create_group("material").attrs.update(vars(simulator.material))
+    # Files of materials without branches stay as they were before there were branches, so that they can be updated.
+    file.create_group("material").attrs.update({key: x for key, x in vars(simulator.material).items() if x != ()})
     for key in ("rest", "quad", "weights", "normal_offset"):
         _write_array(file, f"markers/{key}", getattr(markers, key))
     file["markers/names"] = np.array(markers.names, dtype=h5py.string_dtype())
@@ -239,4 +240,11 @@ def _read(file: h5py.File) -> Dataset:
 def _attributes(group: h5py.Group) -> dict[str, Any]:
     """A group's attributes but its hash, as Python values."""
     found = {key: value for key, value in group.attrs.items() if key != HASH_ATTRIBUTE}
-    return {key: value.item() if isinstance(value, np.generic) else value for key, value in found.items()}
+    return {key: _python_value(value) for key, value in found.items()}
+
+
+def _python_value(value: Any) -> Any:
+    """A number, text, or tuple of numbers."""
+    if isinstance(value, np.ndarray):
+        return tuple(value.tolist())
+    return value.item() if isinstance(value, np.generic) else value

@@ -264,12 +264,12 @@ def _fill_local_tangent(w, project):
                     + w[(_CURVATURE + 3 * i + 2) * 8 + g] * w[(_TURN + 18 + c) * 8 + g]
                 )
         if not project:
-            # Column c = 3 l + m of R^T dF0: minus n where the trace changes, plus n_l along e_m.
-            l = c // 3
+            # Column c = 3 j + m of R^T dF0: minus n where the trace changes, plus n_j along e_m.
+            column = c // 3
             m = c % 3
             for g in range(8):
-                w[(_TEMPORARY + m) * 8 + g] += w[(_MOMENT + l) * 8 + g]
-            if l == m:
+                w[(_TEMPORARY + m) * 8 + g] += w[(_MOMENT + column) * 8 + g]
+            if column == m:
                 for i in range(3):
                     for g in range(8):
                         w[(_TEMPORARY + i) * 8 + g] -= w[(_MOMENT + i) * 8 + g]
@@ -335,10 +335,10 @@ def _add_mean_tangent(w):
     for i in range(3):
         for j in range(3):
             for k in range(3):
-                for l in range(3):
+                for m in range(3):
                     for g in range(8):
-                        w[(_TENSOR + 21 * (3 * j + i) + 3 * l + k) * 8 + g] += w[
-                            (TANGENT + 9 * (3 * i + j) + 3 * k + l) * 8 + g
+                        w[(_TENSOR + 21 * (3 * j + i) + 3 * m + k) * 8 + g] += w[
+                            (TANGENT + 9 * (3 * i + j) + 3 * k + m) * 8 + g
                         ]
 
 
@@ -490,9 +490,7 @@ def enhanced_terms(
                         w[_TEMPORARY * 8 + g] = 0.0
                     for c in range(12):
                         for g in range(8):
-                            w[_TEMPORARY * 8 + g] += (
-                                own[2, (12 * r + c) * 8 + g] * w[(_RATE_VECTORS + c) * 8 + g]
-                            )
+                            w[_TEMPORARY * 8 + g] += own[2, (12 * r + c) * 8 + g] * w[(_RATE_VECTORS + c) * 8 + g]
                     for g in range(8):
                         w[(_VECTORS + r) * 8 + g] += w[_TEMPORARY * 8 + g]
                         if w[WEIGHT * 8 + g] > 0.0:
@@ -559,7 +557,9 @@ def enhanced_measures(q, direction, cells, hexes, columns, volume, strain, local
                     for j in range(3):
                         change[3 * i + j, g] += direction[t, node, i] * columns[group, (8 * j + n) * 8 + g]
                     for k in range(4):
-                        change_vectors[3 * k + i, g] += direction[t, node, i] * columns[group, (8 * (3 + k) + n) * 8 + g]
+                        change_vectors[3 * k + i, g] += (
+                            direction[t, node, i] * columns[group, (8 * (3 + k) + n) * 8 + g]
+                        )
         _fill_kinematics(w, columns[group])
         signed_svd_simd(w)
         _fill_frame(w)
@@ -635,11 +635,7 @@ def enhanced_measures_adjoint(q, by_strain, by_local, cells, hexes, columns, vol
                         low, high = min(j, k), max(j, k)
                         component = low if low == high else (5 if high - low == 2 else 3 + low)
                         share = 1.0 if low == high else 0.5
-                        total += (
-                            share
-                            * by_strain[t, cells[group, g], component]
-                            * w[(DEFORMATION + 3 * i + k) * 8 + g]
-                        )
+                        total += share * by_strain[t, cells[group, g], component] * w[(DEFORMATION + 3 * i + k) * 8 + g]
                     w[(STRESS + 3 * i + j) * 8 + g] = total
         _fill_moment(w)
         _add_frame_stress(w)

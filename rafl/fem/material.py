@@ -12,11 +12,13 @@ from rafl.fem.mesh import HexMesh
 MASS_MODELS = ("lumped", "uniform")
 INTEGRATION_SCHEMES = ("full", "selective", "enhanced")
 
-# Law and mass model of the paper's simulator, and those that are closer to a real specimen.
+# Law, mass model and integration of the paper's simulator, and those that are closer to a real specimen.
 PRESETS: dict[str, dict[str, str]] = {
     "paper": {"law": "projective", "mass": "uniform"},
     "physical": {"law": "corotated", "mass": "lumped", "integration": "enhanced"},
 }
+# Time integration of a simulator of either preset, see `rafl.simulation.time_integration.INTEGRATORS`.
+PRESET_INTEGRATORS = {"paper": "implicit-euler", "physical": "generalised-alpha"}
 
 
 def lame(youngs_modulus: Any, poissons_ratio: Any) -> tuple[Any, Any]:

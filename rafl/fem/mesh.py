@@ -111,7 +111,9 @@ class HexMesh:
                         vertices.append((1.0 - fraction) * self.vertices[edge[0]] + fraction * self.vertices[edge[1]])
                     hexes[e, b] = far[a] = cut[edge]
                 far_parts.append(far)
-        result = HexMesh(np.array(vertices), np.concatenate([hexes, np.array(far_parts, dtype=np.int64).reshape(-1, 8)]))
+        result = HexMesh(
+            np.array(vertices), np.concatenate([hexes, np.array(far_parts, dtype=np.int64).reshape(-1, 8)])
+        )
         if {tuple(sorted(edge)) for edge in cut} & {tuple(edge) for edge in result.edges.tolist()}:
             raise ValueError("expected every cell along an edge to be cut at the nodes alike, found one that is not")
         digits = np.round(result.vertices / np.ptp(result.vertices, axis=0).max(), 9)

@@ -36,8 +36,8 @@ class FittedModel:
     Attributes:
         method: one of `rafl.fitting.methods.METHODS`, or `original` for the baseline simulator.
         field: the residual acceleration field, for `rafl`.
-        material: identified values by their name in `rafl.simulation.parameters.Parameters`, for the `sysid` methods
-            and for a field that was trained on top of an identified material.
+        material: identified values by their name in `rafl.simulation.parameters.Parameters`, numbers or lists, for the
+            `sysid` methods and for a field that was trained on top of an identified material.
         network: from the whole state to nodal forces, for `srl`.
         time_integration: `integrator` and `substeps` of the simulator that the model was fitted in; None for the
             specimen's own.
@@ -46,7 +46,7 @@ class FittedModel:
 
     method: str
     field: ResidualField | None = None
-    material: dict[str, float] | None = None
+    material: dict[str, float | list[float]] | None = None
     network: GlobalResidual | None = None
     time_integration: dict[str, Any] | None = None
     own: ResidualModel | None = None

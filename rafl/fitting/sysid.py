@@ -1,4 +1,4 @@
-"""System identification by exact gradients (paper, SysID baseline): E and nu, E alone, or E, nu and viscosity."""
+"""System identification by exact gradients (paper, SysID baseline): E, nu, viscosity, loss factor, Maxwell branches."""
 
 import itertools
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ from rafl.common.errors import SimulationError
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.data.objective import training_loss
+from rafl.fem.maxwell import branch_shares, branch_times
 from rafl.fitting.run_folder import (
     FORMAT,
     FittedModel,
@@ -57,11 +58,12 @@ class Quantity:
     """A parameter to identify, and the transformed variable in which the search is evenly scaled.
 
     Attributes:
-        name: in `rafl.simulation.parameters.Parameters`.
+        name: in `rafl.simulation.parameters.Parameters`, `tan_delta`, or `branch_share_1` and so on.
         low, high: bounds.
         kind: the variable is, for a value p, `log`: log p; `gap`: log (1/2 - p); `root`: the square root of p / scale.
         unit: for messages.
         scale: of `root`, in the unit of the value.
+        start: value to start from if the assumed material has none, or less.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Quantity:
     kind: str
     unit: str
     scale: float = 1.0
+    start: float = 0.0
 
     def variable(self, value: float) -> float:
         """The variable of a value."""
@@ -92,13 +95,35 @@ class Quantity:
 
 
 MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa")
-POISSON = Quantity("poissons_ratio", 0.3, 0.499, "gap", "")
-VISCOSITY = Quantity("viscosity", 0.0, 1e4, "root", "Pa s", scale=100.0)
+POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "gap", "")
+VISCOSITY = Quantity("viscosity", 0.0, 1e4, "root", "Pa s", scale=100.0, start=100.0)
+LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "root", "", scale=0.1, start=0.1)
+LOSS_FREQUENCIES = (0.5, 50.0)  # [Hz]; from the slowest swings of large specimens to half of 100 frames/s
+BRANCH_TIMES = branch_times(*LOSS_FREQUENCIES)  # [s]
+SHARES = tuple(
+    Quantity(f"branch_share_{k + 1}", 0.0, 1.0, "root", "", scale=0.1, start=0.05) for k in range(len(BRANCH_TIMES))
+)
 METHOD_QUANTITIES = {
     "sysid": (MODULUS, POISSON),
     "sysid-e": (MODULUS,),
     "sysid-damping": (MODULUS, POISSON, VISCOSITY),
+    "sysid-loss": (MODULUS, POISSON, LOSS_FACTOR),
+    "sysid-branches": (MODULUS, POISSON, VISCOSITY, *SHARES),
 }
+
+
+def material_values(identified: dict[str, Any]) -> dict[str, Any]:
+    """Values by their name in `rafl.simulation.parameters.Parameters` from those of quantities, floats or tensors."""
+    values = {"poissons_ratio": FIXED_POISSONS_RATIO, **identified}
+    tan_delta = values.pop(LOSS_FACTOR.name, None)
+    shares = [values.pop(share.name) for share in SHARES if share.name in values]
+    if tan_delta is not None:
+        values["branch_shares"] = branch_shares(torch.as_tensor(tan_delta, dtype=torch.float64), *LOSS_FREQUENCIES)
+    elif shares:
+        values["branch_shares"] = torch.stack([torch.as_tensor(share, dtype=torch.float64) for share in shares])
+    if "branch_shares" in values:
+        values["branch_times"] = torch.tensor(BRANCH_TIMES, dtype=torch.float64)
+    return values
 
 
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
@@ -153,10 +178,8 @@ class _Search:
 
     def starting_points(self) -> list[Array]:
         """Variables to start from; those of the assumed material come first."""
-        assumed = {q: max(float(getattr(self.simulator.material, q.name)), q.low) for q in self.quantities}
-        own = np.array([np.clip(q.variable(value), *q.bounds) for q, value in assumed.items()])
-        if self.settings.method == "sysid-damping":
-            own[2] = max(own[2], VISCOSITY.variable(VISCOSITY.scale))
+        assumed = [max(float(getattr(self.simulator.material, q.name, 0.0)), q.low, q.start) for q in self.quantities]
+        own = np.array([np.clip(q.variable(x), *q.bounds) for q, x in zip(self.quantities, assumed, strict=True)])
         points = [own]
         for factor in START_FACTORS:
             other = own.copy()
@@ -164,14 +187,16 @@ class _Search:
             points.append(other)
         return points
 
-    def values(self, x: Any) -> dict[str, Any]:
-        """Material parameters, by name, of variables x."""
-        identified = {q.name: q.value(x[k]) for k, q in enumerate(self.quantities)}
-        return {"poissons_ratio": FIXED_POISSONS_RATIO, **identified} if len(identified) == 1 else identified
+    def identified(self, x: Any) -> dict[str, Any]:
+        """Values of the quantities, by name, of variables x."""
+        return {q.name: q.value(x[k]) for k, q in enumerate(self.quantities)}
 
     def model(self, x: Array) -> FittedModel:
         """The model with the material of variables x."""
-        material = {name: float(value) for name, value in self.values(x).items()}
+        values = material_values(self.identified(x))
+        material = {
+            name: value.tolist() if isinstance(value, Tensor) else float(value) for name, value in values.items()
+        }
         return FittedModel(self.settings.method, material=material, time_integration=self.simulator.time_integration)
 
     def __call__(self, x: Array) -> tuple[float, Array]:
@@ -195,7 +220,7 @@ class _Search:
 
     def _simulate(self, x: Array) -> tuple[float, list[float]]:
         variables = torch.tensor(x, dtype=torch.float64, requires_grad=True)
-        values = self.values(variables)
+        values = material_values(self.identified(variables))
         count = sum(len(recordings.names) for recordings in self.training)
         total = torch.zeros((), dtype=torch.float64)
         for recordings in (each.first_frames(self.frames) for each in self.training):
@@ -228,10 +253,9 @@ class _Search:
 
     def record(self, x: Array, number: int) -> None:
         """Append a row to the history, write it and report it."""
-        model = self.model(x)
-        assert model.material is not None
-        error = 1e3 * mean_error(self.validation, model)
-        self.history.append({"epoch": number, "loss": self(x)[0], "validation_mm": error, **model.material})
+        error = 1e3 * mean_error(self.validation, self.model(x))
+        values = {"poissons_ratio": FIXED_POISSONS_RATIO, **{k: float(v) for k, v in self.identified(x).items()}}
+        self.history.append({"epoch": number, "loss": self(x)[0], "validation_mm": error, **values})
         write_history(self.run, self.history)
         self.report(self.history[-1])
 

@@ -136,7 +136,8 @@ def _start_and_datasets(datasets: list[Dataset], settings: Settings) -> tuple[Fi
     An integrator in the settings overrides the model's time integration.
     """
     start = load_start_model(Path(settings.start)) if settings.start else FittedModel("rafl")
-    values: dict[str, Any] = dict(start.material or {})
+    identified = (start.material or {}).items()
+    values: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in identified}
     used = []
     for dataset in (_with_integrator(item, settings) for item in datasets):
         simulator = dataset.simulator if settings.integrator else start.simulator(dataset.simulator)

@@ -206,7 +206,7 @@ def _viscous_weights(engine: Engine) -> Array:
 
 
 def _dual_of_viscous_strain(engine: Engine, state: ConstitutiveState, change: Array) -> Array:
-    """Derivative of adjoint . viscous force by the viscous strain g E - memory, (B, E, Z); `change` is along adjoint."""
+    """Derivative of adjoint . viscous force by the viscous strain g E - memory, (B, E, Z); `change`: along adjoint."""
     weights = _viscous_weights(engine)
     dual = np.empty_like(change)
     dual[..., : weights.shape[1]] = weights * change[..., : weights.shape[1]]
@@ -222,7 +222,11 @@ def _by_hourglass(
     """Minus adjoint . d(internal force) / d(stiffness of the hourglass modes), (3, B, U, 12, 12)."""
     assert state.hourglass is not None
     own, along = strain[..., -MODES:], change[..., -MODES:]
-    parts = [_by_shape(engine, along, own), np.zeros_like(state.hourglass.elastic), np.zeros_like(state.hourglass.elastic)]
+    parts = [
+        _by_shape(engine, along, own),
+        np.zeros_like(state.hourglass.elastic),
+        np.zeros_like(state.hourglass.elastic),
+    ]
     if state.hourglass_memory is not None:
         viscous_strain = state.moduli[:, VISCOUS, None, None] * own - state.hourglass_memory
         parts[1] = _by_shape(engine, along, viscous_strain)

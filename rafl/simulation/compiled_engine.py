@@ -41,7 +41,9 @@ class CompiledEngine:
         self.quadrature = QuadratureRule.from_scheme(mesh, integration)
         self.hourglass_modes = HourglassModes(mesh)
         self._elements: CompiledElements = (
-            EnhancedElements(self.hourglass_modes, law) if integration == "enhanced" else PointElements(mesh, law, self.quadrature)
+            EnhancedElements(self.hourglass_modes, law)
+            if integration == "enhanced"
+            else PointElements(mesh, law, self.quadrature)
         )
         self._cells_at_fixed = np.flatnonzero(np.isin(mesh.hexes, fixed).any(axis=1))
 

@@ -1,4 +1,4 @@
-"""Hourglass terms of `enhanced` integration in plain tensors, by automatic differentiation; see `rafl.fem.hourglass`."""
+"""Hourglass terms of `enhanced` integration in plain, differentiable tensors; see `rafl.fem.hourglass`."""
 
 import torch
 from torch import Tensor

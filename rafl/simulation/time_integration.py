@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 from typing import Protocol
 
-import torch
 from torch import Tensor
 
 
@@ -116,4 +115,3 @@ INTEGRATORS: dict[str, Integrator] = {
     "implicit-euler": ImplicitEuler(),
     "generalised-alpha": GeneralisedAlpha(0.5),
 }
-

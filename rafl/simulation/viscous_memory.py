@@ -1,7 +1,7 @@
 """Memory of the viscous stress: Kelvin-Voigt viscosity and any number of Maxwell branches, as one quadratic form.
 
-A branch of modulus G and relaxation time tau (a spring and a dashpot in series, beside the elastic law) adds the second
-Piola-Kirchhoff stress 2 G A, where dA/dt = dE/dt - A / tau and E is the Green strain. If E is linear over an interval h,
+A branch of modulus G and relaxation time tau, a spring and a dashpot in series beside the elastic law, adds the second
+Piola-Kirchhoff stress 2 G A, where dA/dt = dE/dt - A / tau and E is the Green strain. If E is linear over h,
 
     A = e A0 + c (E - E0),   e = exp(-h / tau),   c = (1 - e) tau / h,
 
@@ -72,6 +72,4 @@ class ViscousMemory:
             branch_strain = c * (strain - self.strain)
             if self.branch_strain is not None:
                 branch_strain = branch_strain + e * self.branch_strain
-        return replace(
-            self, strain=strain, earlier_strain=self.strain, interval=h, branch_strain=branch_strain
-        )
+        return replace(self, strain=strain, earlier_strain=self.strain, interval=h, branch_strain=branch_strain)
