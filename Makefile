@@ -7,7 +7,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 # BLAS threads would compete with the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
+.PHONY: install demo test test-slow lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
 	bench-simulator bench-tracking bench-paper bench-capture bench-sim2real clean
 
 install: $(VENV)/installed $(VENV)/kernels
@@ -35,6 +35,10 @@ demo: install
 # Two workers of one thread each: kernels with several threads in each would compete for the cores.
 test: install lint docs
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
+
+# Long runs: 10,000 time steps, oscillations of 10 s.
+test-slow: install
+	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -m slow -n 2 --dist worksteal
 
 # Type checkers look for rafl.tracking in the folder rafl; these links put it there.
 build/types: $(VENV)/installed $(wildcard rafl/*)

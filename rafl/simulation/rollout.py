@@ -1,6 +1,6 @@
 """Differentiable simulation: trajectories of implicit steps, and static equilibria."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
@@ -120,6 +120,70 @@ class _BodyBatch:
         return free * ((x - state.q) / duration - state.v) / duration
 
 
+@dataclass(frozen=True)
+class Step:
+    """The end of one time step.
+
+    Attributes:
+        state: positions, velocities and accelerations.
+        residual_force: of the residual model during the step [N], (B, N, 3), or None without one.
+        memory: of the viscous stress, or None without viscosity.
+    """
+
+    state: State
+    residual_force: Tensor | None
+    memory: ViscousMemory | None
+
+
+def simulate_steps(
+    simulator: Simulator,
+    start: Start,
+    steps: int,
+    residual: ResidualForce | None = None,
+    parameters: Parameters | None = None,
+    clamp: Tensor | None = None,
+) -> Iterator[Step]:
+    """The time steps of `rollout`, with the same arguments, one after the other.
+
+    Raises:
+        SimulationError: a step failed; names trajectory, step and residual.
+    """
+    integrator = INTEGRATORS[simulator.integrator]
+    body = _BodyBatch.of(simulator, parameters, start.added_mass)
+    external = start.force + body.weight
+    h = simulator.time_step / simulator.substeps
+    alpha = body.parameters.mass_damping.expand(len(start.q))[:, None]
+    factors = simulator.engine.allocate(len(start.q))
+    fixed = torch.from_numpy(simulator.fixed)
+    state = State(start.q, start.v, torch.zeros_like(start.q))
+    memory = body.initial_memory(state)
+    duration = integrator.fraction * h  # from the latest solution to the next
+    begin = start.q[:, fixed]
+    for step in range(steps):
+        residual_force = None if residual is None else residual(state.q, state.v, external)
+        force = external if residual_force is None else external + residual_force
+        if clamp is not None:
+            begin = state.q[:, fixed]
+        if step == 0 and integrator.uses_acceleration:
+            share = FIRST_ACCELERATION_FRACTION / simulator.substeps
+            fixed_positions = begin if clamp is None else (1.0 - share) * begin + share * clamp[0]
+            short = FIRST_ACCELERATION_FRACTION * h
+            acceleration = body.initial_acceleration(state, force, alpha, fixed_positions, memory, short)
+            state = State(state.q, state.v, acceleration)
+        for substep in range(simulator.substeps):
+            problem = integrator.problem(state, body.mass, alpha, h)
+            fixed_positions = begin
+            if clamp is not None:
+                share = (substep + integrator.fraction) / simulator.substeps
+                fixed_positions = (1.0 - share) * begin + share * clamp[step]
+            try:
+                x, memory = body.solve(problem, force, fixed_positions, memory, duration, f"step {step + 1}", factors)
+            except SimulationError as error:
+                raise SimulationError(f"{error} [trajectories: {', '.join(start.names)}]") from None
+            state, duration = integrator.advance(state, x, h), h
+        yield Step(state, residual_force, memory)
+
+
 def rollout(
     simulator: Simulator,
     start: Start,
@@ -148,43 +212,11 @@ def rollout(
     Raises:
         SimulationError: a step failed; names trajectory, step and residual.
     """
-    integrator = INTEGRATORS[simulator.integrator]
-    body = _BodyBatch.of(simulator, parameters, start.added_mass)
-    external = start.force + body.weight
-    h = simulator.time_step / simulator.substeps
-    alpha = body.parameters.mass_damping.expand(len(start.q))[:, None]
-    factors = simulator.engine.allocate(len(start.q))
-    fixed = torch.from_numpy(simulator.fixed)
-    state = State(start.q, start.v, torch.zeros_like(start.q))
-    memory = body.initial_memory(state)
-    duration = integrator.fraction * h  # from the latest solution to the next
     positions, forces = [start.q], []
-    begin = start.q[:, fixed]
-    for step in range(steps):
-        force = external
-        if residual is not None:
-            forces.append(residual(state.q, state.v, external))
-            force = external + forces[-1]
-        if clamp is not None:
-            begin = state.q[:, fixed]
-        if step == 0 and integrator.uses_acceleration:
-            share = FIRST_ACCELERATION_FRACTION / simulator.substeps
-            fixed_positions = begin if clamp is None else (1.0 - share) * begin + share * clamp[0]
-            begin_duration = FIRST_ACCELERATION_FRACTION * h
-            acceleration = body.initial_acceleration(state, force, alpha, fixed_positions, memory, begin_duration)
-            state = State(state.q, state.v, acceleration)
-        for substep in range(simulator.substeps):
-            problem = integrator.problem(state, body.mass, alpha, h)
-            fixed_positions = begin
-            if clamp is not None:
-                share = (substep + integrator.fraction) / simulator.substeps
-                fixed_positions = (1.0 - share) * begin + share * clamp[step]
-            try:
-                x, memory = body.solve(problem, force, fixed_positions, memory, duration, f"step {step + 1}", factors)
-            except SimulationError as error:
-                raise SimulationError(f"{error} [trajectories: {', '.join(start.names)}]") from None
-            state, duration = integrator.advance(state, x, h), h
-        positions.append(state.q)
+    for step in simulate_steps(simulator, start, steps, residual, parameters, clamp):
+        positions.append(step.state.q)
+        if step.residual_force is not None:
+            forces.append(step.residual_force)
     return torch.stack(positions), torch.stack(forces) if forces else start.q.new_zeros(0)
 
 
