@@ -100,6 +100,14 @@ def training_loss(recordings: Recordings, simulated: Tensor, forces: Tensor, for
     return LOSS_SCALE * (total / steps).mean()
 
 
+def loss_curvature(recordings: Recordings, slope: Tensor) -> Tensor:
+    """Gauss-Newton matrix (n, n) of `training_loss` without a penalty; slope of the markers (T, n, B, M, 3) [m]."""
+    steps = recordings.valid[1:].amax(-1).sum(0).clamp_min(1.0)  # (B)
+    weight = recordings.weight[1:] / steps[:, None, None]
+    products = torch.einsum("tkbmi,tlbmi,tbmi->kl", slope[1:], slope[1:], weight)
+    return 2.0 * LOSS_SCALE * products / len(steps)
+
+
 def frame_errors(recordings: Recordings, simulated: Tensor) -> list[NDArray[np.float64]]:
     """For each recording, the mean distance of the observed markers in every frame with any [m], (T_r).
 

@@ -9,13 +9,13 @@ import numpy as np
 import pandas as pd
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import minimize
+from scipy.optimize import least_squares
 from torch import Tensor
 
 from rafl.common.errors import SimulationError
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.data.objective import training_loss
+from rafl.data.objective import Recordings, loss_curvature, training_loss
 from rafl.fem.maxwell import branch_shares, branch_times
 from rafl.fitting.run_folder import (
     FORMAT,
@@ -35,6 +35,7 @@ from rafl.fitting.train_field import (
     training_items,
     validation_batches,
 )
+from rafl.simulation.rollout import rollout
 
 Array = NDArray[Any]
 
@@ -45,11 +46,13 @@ START_FACTORS = (0.6, 1.7)  # times the assumed E: further starting points
 FRAME_FRACTIONS = (0.15, 0.4)
 MIN_FRAMES = 8
 ITERATIONS_PER_STAGE = 3
-VARIABLE_SCALE = 0.2  # of every variable, for L-BFGS-B; its first step is about as long
 NORMAL_QUANTILE_95 = 1.959964  # a normal distribution has 95 % within this many sigmas
 FAILURE_LOSS = 1e6  # loss where a simulation fails
 MIN_LOSS = 1e-30  # smallest divisor, for a loss of zero
-CURVATURE_STEP = 1e-3  # of a variable, for finite differences of the exact gradient
+DIFFERENCE_STEP = 1e-4  # of a variable, for the derivatives of the markers in the Gauss-Newton matrix
+MIN_RELATIVE_CURVATURE = 1e-12  # of the Gauss-Newton matrix; directions of less are taken as undetermined
+# Largest decrease of the loss that Newton's method still expects where a search ended at a minimum, relative to it.
+MAX_EXPECTED_DECREASE = 1e-3
 MIN_REPORTED_CORRELATION = 0.9
 
 
@@ -113,21 +116,26 @@ METHOD_QUANTITIES = {
 
 
 def material_values(identified: dict[str, Any]) -> dict[str, Any]:
-    """Values by their name in `rafl.simulation.parameters.Parameters` from those of quantities, floats or tensors."""
+    """Values by their name in `rafl.simulation.parameters.Parameters` from those of quantities.
+
+    Values of quantities are floats or tensors (..); shares of K branches are (.., K).
+    """
     values = {"poissons_ratio": FIXED_POISSONS_RATIO, **identified}
     tan_delta = values.pop(LOSS_FACTOR.name, None)
     shares = [values.pop(share.name) for share in SHARES if share.name in values]
     if tan_delta is not None:
         values["branch_shares"] = branch_shares(torch.as_tensor(tan_delta, dtype=torch.float64), *LOSS_FREQUENCIES)
     elif shares:
-        values["branch_shares"] = torch.stack([torch.as_tensor(share, dtype=torch.float64) for share in shares])
+        values["branch_shares"] = torch.stack([torch.as_tensor(share, dtype=torch.float64) for share in shares], dim=-1)
     if "branch_shares" in values:
         values["branch_times"] = torch.tensor(BRANCH_TIMES, dtype=torch.float64)
     return values
 
 
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
-    """Fit material parameters to the training recordings by L-BFGS-B within bounds, from several starting points.
+    """Fit material parameters to the training recordings by least squares within bounds, from several starting points.
+
+    Gradients are exact; the Gauss-Newton matrix is from differences of simulations that run as one batch.
 
     The search starts from the datasets' assumed material and from a softer and a stiffer one, on the first frames of
     the recordings. The best result continues with more frames, and finally with all. `parameters.csv` in the run
@@ -164,12 +172,12 @@ class _Search:
         self.simulator = used[0].simulator
         self.frames = 0  # number of frames to simulate
         self.history: list[dict[str, float]] = []
-        self.evaluations: dict[tuple[float, ...], tuple[float, list[float]]] = {}  # by frames and variables
+        self.evaluations: dict[tuple[float, ...], Evaluation] = {}  # by frames and variables
         self.checkpoint = run / "checkpoint.pt"
         if self.checkpoint.exists():
             saved = load_tensors(self.checkpoint, "a checkpoint of this run")
             with expect_content("a checkpoint of this version", self.checkpoint):
-                self.evaluations = {tuple(key): (loss, gradient) for key, loss, gradient in saved["known"]}
+                self.evaluations = {tuple(key): Evaluation(*values) for key, *values in saved["known"]}
 
     def use_frames(self, fraction: float) -> None:
         """Set the fraction of the frames that is simulated."""
@@ -199,81 +207,104 @@ class _Search:
         }
         return FittedModel(self.settings.method, material=material, time_integration=self.simulator.time_integration)
 
-    def __call__(self, x: Array) -> tuple[float, Array]:
-        """Loss and its gradient. The loss is very high where a simulation fails, so that the line search returns."""
-        try:
-            loss, gradient = self._evaluate(x)
-        except SimulationError:
-            if not self.evaluations:
-                raise
-            return FAILURE_LOSS, np.zeros(len(x))
-        return loss, np.array(gradient)
-
-    def _evaluate(self, x: Array) -> tuple[float, list[float]]:
-        """Loss and its gradient, from the checkpoint or else simulated."""
+    def evaluate(self, x: Array) -> "Evaluation":
+        """The loss at variables x, from the checkpoint or else simulated; very high where a simulation fails."""
         key = (float(self.frames), *(float(value) for value in x))
         if key not in self.evaluations:
-            self.evaluations[key] = self._simulate(x)
-            content = [[list(each), loss, gradient] for each, (loss, gradient) in self.evaluations.items()]
+            try:
+                self.evaluations[key] = self._simulate(x)
+            except SimulationError:
+                if not self.evaluations:
+                    raise
+                return Evaluation(FAILURE_LOSS, [0.0] * len(x), np.eye(len(x)).tolist())
+            content = [[list(each), *vars(known).values()] for each, known in self.evaluations.items()]
             save_tensors(self.checkpoint, {"format": FORMAT, "method": self.settings.method, "known": content})
         return self.evaluations[key]
 
-    def _simulate(self, x: Array) -> tuple[float, list[float]]:
-        variables = torch.tensor(x, dtype=torch.float64, requires_grad=True)
-        values = material_values(self.identified(variables))
+    def _simulate(self, x: Array) -> "Evaluation":
         count = sum(len(recordings.names) for recordings in self.training)
+        variables = torch.tensor(x, dtype=torch.float64, requires_grad=True)
         total = torch.zeros((), dtype=torch.float64)
+        matrix = np.zeros((len(x), len(x)))
         for recordings in (each.first_frames(self.frames) for each in self.training):
+            values = material_values(self.identified(variables))
             simulated, forces = recordings.simulate(parameters=recordings.dataset.simulator.parameters(**values))
-            total = total + training_loss(recordings, simulated, forces) * len(recordings.names) / count
+            share = len(recordings.names) / count
+            total = total + training_loss(recordings, simulated, forces) * share
+            matrix += share * self._gauss_newton_matrix(x, recordings, simulated.detach())
         torch.autograd.backward(total)
         assert variables.grad is not None
-        return total.item(), variables.grad.tolist()
+        return Evaluation(total.item(), variables.grad.tolist(), matrix.tolist())
 
-    def descend(self, start: Array, iterations: int) -> tuple[float, Array]:
-        """Minimise by L-BFGS-B from a starting point; returns the loss and the variables."""
-        scale = max(self(start)[0], MIN_LOSS)
+    def _gauss_newton_matrix(self, x: Array, recordings: Recordings, simulated: Tensor) -> Array:
+        """Second derivatives of the loss, without those of the markers, (n, n); all differences in one batch."""
+        changed = torch.from_numpy(x + DIFFERENCE_STEP * np.eye(len(x)))
+        values = material_values(self.identified(changed.T))
+        batch = len(recordings.names)
+        # Every parameter set with every recording: (n) or (n, K) becomes (n batch) or (n batch, K).
+        shared = ("branch_times", *(("poissons_ratio",) if POISSON not in self.quantities else ()))
+        parameters = {key: x.repeat_interleave(batch, 0) for key, x in values.items() if key not in shared}
+        simulator = recordings.dataset.simulator
+        start = recordings.dataset.start(recordings.names * len(x))
+        with torch.no_grad():
+            positions, _ = rollout(
+                simulator, start, len(recordings.markers) - 1, parameters=simulator.parameters(**(values | parameters))
+            )
+            markers = recordings.dataset.markers.positions(positions)
+        shape = (len(markers), len(x), batch, *markers.shape[2:])
+        slope = (markers.reshape(shape) - simulated[:, None]) / DIFFERENCE_STEP
+        return loss_curvature(recordings, slope).numpy()
 
-        def scaled(y: Array) -> tuple[float, Array]:
-            loss, gradient = self(y * VARIABLE_SCALE)
-            return loss / scale, gradient * VARIABLE_SCALE / scale
-
+    def descend(self, start: Array, evaluations: int) -> tuple[float, Array]:
+        """Minimise by trust-region least squares within bounds from a starting point; the loss and the variables."""
         if not self.history:
             self.record(start, 0)
-        result = minimize(
-            scaled,
-            start / VARIABLE_SCALE,
-            jac=True,
-            method="L-BFGS-B",
-            bounds=[(q.bounds[0] / VARIABLE_SCALE, q.bounds[1] / VARIABLE_SCALE) for q in self.quantities],
-            callback=lambda y: self.record(y * VARIABLE_SCALE, int(self.history[-1]["epoch"]) + 1),
-            options={"maxiter": iterations, "ftol": 1e-9, "gtol": 1e-8},
+
+        def slopes(x: Array) -> Array:
+            if (x != start).any():  # called where a step was accepted
+                self.record(x, int(self.history[-1]["epoch"]) + 1)
+            return self.evaluate(x).equivalent_residuals[1]
+
+        lows, highs = zip(*(q.bounds for q in self.quantities), strict=True)
+        result = least_squares(
+            lambda x: self.evaluate(x).equivalent_residuals[0],
+            start,
+            slopes,
+            bounds=(lows, highs),
+            x_scale="jac",
+            ftol=1e-9,
+            xtol=1e-7,
+            gtol=1e-12,
+            max_nfev=evaluations,
         )
-        return scale * float(result.fun), result.x * VARIABLE_SCALE
+        return self.evaluate(result.x).loss, result.x
 
     def record(self, x: Array, number: int) -> None:
         """Append a row to the history, write it and report it."""
         error = 1e3 * mean_error(self.validation, self.model(x))
         values = {"poissons_ratio": FIXED_POISSONS_RATIO, **{k: float(v) for k, v in self.identified(x).items()}}
-        self.history.append({"epoch": number, "loss": self(x)[0], "validation_mm": error, **values})
+        self.history.append({"epoch": number, "loss": self.evaluate(x).loss, "validation_mm": error, **values})
         write_history(self.run, self.history)
         self.report(self.history[-1])
 
     def parameter_table(self, x: Array) -> str:
         """CSV text with each value, its 95 % interval and its correlations with the others.
 
-        Marker errors are assumed independent and as large as the residuals of the fit; the curvature of the loss then
-        gives the information matrix. A value at its bound has no interval. No value has one if a material near the
-        best cannot be simulated or if the search ended before a minimum.
+        Marker errors are assumed independent and as large as the residuals of the fit; the Gauss-Newton matrix then
+        gives the information matrix. A value at its bound has no interval. No value has one if the search ended before
+        a minimum.
         """
-        lows, highs = zip(*(q.bounds for q in self.quantities), strict=True)
-        inside = [k for k in range(len(x)) if lows[k] + CURVATURE_STEP < x[k] < highs[k] - CURVATURE_STEP]
+        lows, highs = (np.array(ends) for ends in zip(*(q.bounds for q in self.quantities), strict=True))
+        margin = 1e-3 * (highs - lows)
+        inside = np.flatnonzero((lows + margin < x) & (x < highs - margin))
         covariance = np.full((len(x), len(x)), np.nan)
-        curvature = self._curvature(x, inside)
-        if curvature is not None and np.linalg.eigvalsh(curvature)[0] > 0.0:
-            observed = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.training)
-            own = 2.0 * self(x)[0] / max(observed - len(x), 1.0) * np.linalg.pinv(curvature)
-            covariance[np.ix_(inside, inside)] = own
+        found = self.evaluate(x)
+        matrix, gradient = np.array(found.curvature)[np.ix_(inside, inside)], np.array(found.gradient)[inside]
+        if len(inside) and np.linalg.eigvalsh(matrix)[0] > MIN_RELATIVE_CURVATURE * np.trace(matrix):
+            inverse = np.linalg.inv(matrix)
+            if gradient @ inverse @ gradient <= 2.0 * MAX_EXPECTED_DECREASE * found.loss:
+                observed = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.training)
+                covariance[np.ix_(inside, inside)] = 2.0 * found.loss / max(observed - len(x), 1.0) * inverse
         sigma = np.sqrt(np.diag(covariance))
         names = [q.name for q in self.quantities]
         lines = ["name,unit,value,low_95,high_95," + ",".join(f"correlation_{name}" for name in names)]
@@ -285,20 +316,31 @@ class _Search:
             lines.append(f"{q.name},{q.unit}," + ",".join("" if np.isnan(cell) else f"{cell:.6g}" for cell in cells))
         return "\n".join(lines) + "\n"
 
-    def _curvature(self, x: Array, chosen: list[int]) -> Array | None:
-        """Second derivatives of the loss with respect to the chosen variables.
 
-        None if no variable is chosen or a simulation fails.
-        """
-        columns = []
-        for k in chosen:
-            h = CURVATURE_STEP * np.eye(len(x))[k]
-            try:
-                ahead, behind = (np.array(self._evaluate(point)[1]) for point in (x + h, x - h))
-            except SimulationError:
-                return None
-            columns.append((ahead - behind)[chosen] / (2.0 * CURVATURE_STEP))
-        return 0.5 * (np.array(columns) + np.array(columns).T) if columns else None
+@dataclass(frozen=True)
+class Evaluation:
+    """The loss at some variables (n).
+
+    Attributes:
+        loss: see `rafl.data.objective.training_loss`.
+        gradient: exact, (n).
+        curvature: Gauss-Newton matrix, (n, n).
+    """
+
+    loss: float
+    gradient: list[float]
+    curvature: list[list[float]]
+
+    @property
+    def equivalent_residuals(self) -> tuple[Array, Array]:
+        """Residuals r (n + 1) and slopes J (n + 1, n) with r^2 / 2 = loss, J^T r = gradient and J^T J = curvature."""
+        values, vectors = np.linalg.eigh(np.array(self.curvature))
+        roots = np.sqrt(np.maximum(values, MIN_RELATIVE_CURVATURE * max(values[-1], MIN_LOSS)))
+        along = vectors.T @ np.array(self.gradient) / roots
+        # Rounding and the differences may leave less loss than the gradient implies.
+        along *= min(1.0, np.sqrt(2.0 * self.loss / max(along @ along, MIN_LOSS)))
+        rest = np.sqrt(max(2.0 * self.loss - along @ along, 0.0))
+        return np.append(along, rest), np.vstack([roots[:, None] * vectors.T, np.zeros(len(roots))])
 
 
 def parameter_sentences(table: pd.DataFrame) -> list[str]:
@@ -308,10 +350,7 @@ def parameter_sentences(table: pd.DataFrame) -> list[str]:
         unit = f" {row['unit']}" if isinstance(row["unit"], str) else ""
         interval = f"95 % interval {row['low_95']:.5g} to {row['high_95']:.5g}"
         if not np.isfinite(row["low_95"]):
-            interval = (
-                "no interval: the value is at its bound, the search ended before a minimum, or a material nearby "
-                "cannot be simulated"
-            )
+            interval = "no interval: the value is at its bound, or the search ended before a minimum"
         lines.append(f"{row['name']} = {row['value']:.5g}{unit} ({interval})")
     for a, b in itertools.combinations(range(len(table)), 2):
         c = float(table[f"correlation_{table['name'][b]}"][a])
