@@ -36,7 +36,7 @@ class CompiledEngine:
         self.mesh = mesh
         self.fixed = fixed
         self._reused: Factors | None = None  # storage that repeated calls of `solve_once` share
-        self.law = list(LAWS).index(law)
+        self.law = law
         self.quadrature = QuadratureRule.from_scheme(mesh, integration)
         cells, groups = len(mesh.hexes), len(self.quadrature.group_shares)
         gradient = self.quadrature.points.gradient.reshape(cells, groups, 8, 8, 3)  # (.., point, node, component)
@@ -85,7 +85,7 @@ class CompiledEngine:
             self._gradients_by_node,
             self._volume,
             self.quadrature.group_shares,
-            self.law,
+            LAWS[self.law].kernel.address,
             state.moduli,
             state.damped,
             unused[0] if state.velocity_offset is None else state.velocity_offset,
