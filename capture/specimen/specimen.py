@@ -5,12 +5,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from rafl.capture.specimen.geometry import Geometry
 from rafl.common.errors import InputError
 from rafl.common.yaml_files import StrictModel, read_yaml
 from rafl.data.markers import Markers, embed, embedding_gap
+from rafl.fem.laws import LAWS
 from rafl.fem.material import PRESETS, Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.simulator import Simulator
@@ -20,12 +21,18 @@ DEFAULT_PRESET: Literal["paper", "physical"] = "physical"
 Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
 
 
+def _known_law(name: str) -> str:
+    if name not in LAWS:
+        raise ValueError(f"Input should be one of {', '.join(LAWS)}")
+    return name
+
+
 class _Material(StrictModel):
     youngs_modulus: float = Field(gt=0)
     poissons_ratio: float = Field(gt=-1, lt=0.5)
     density: float = Field(gt=0)
     preset: Literal["paper", "physical"] = DEFAULT_PRESET
-    law: Literal["projective", "corotated", "neo-hookean"] | None = None
+    law: Annotated[str, AfterValidator(_known_law)] | None = None
     mass: Literal["uniform", "lumped"] | None = None
     integration: Literal["full", "selective"] = "full"
     mass_damping: float = Field(default=0.0, ge=0)

@@ -53,6 +53,7 @@ def register_law(name: str, energy: Energy) -> Law:
     kept, compiled, in numba's cache folder.
 
     Where an energy is not defined, for instance log(s0 * s1 * s2) in an inverted cell, the solver shortens its steps.
+    If a time step begins there, it raises a SimulationError. Powers of (s0 * s1 * s2 - 1) are defined everywhere.
 
     Raises:
         ValueError: the name is that of a law of the package, or the energy is not admissible; says why.

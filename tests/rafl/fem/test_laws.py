@@ -15,6 +15,7 @@ from numba import njit
 from scipy.optimize import brentq, minimize
 from support import ROOT
 
+from rafl.common.errors import SimulationError
 from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.fem.elements import element_terms
 from rafl.fem.kernel_layout import ENERGY, FIRST, FLIP, ROWS, SECOND, STRETCH
@@ -276,6 +277,17 @@ def test_gradient_by_the_modulus_of_an_own_law(own_law: str) -> None:
     height(modulus).backward()
     up, down = (float(height(torch.tensor(5e4 + h, dtype=torch.float64))) for h in (50.0, -50.0))
     assert float(modulus.grad) == pytest.approx((up - down) / 100.0, rel=1e-4)  # type: ignore[arg-type]
+
+
+def test_a_step_that_begins_where_the_energy_is_not_defined(own_law: str) -> None:
+    """A tip that flies through its clamp inverts the cell, whose volume has no logarithm: an error, no result."""
+    mesh = HexMesh.box((1, 1, 1), (0.02, 0.02, 0.02))
+    simulator = Simulator(mesh, Material(law=own_law, mass="lumped"), mesh.face_nodes("x-min"))
+    v = torch.zeros(1, *mesh.vertices.shape, dtype=torch.float64)
+    v[:, mesh.face_nodes("x-max"), 0] = -3.0
+    start = Start(torch.tensor(mesh.vertices[None]), v, 0 * v, 0 * v[..., 0], ("tip",))
+    with pytest.raises(SimulationError, match="step 1"):
+        rollout(simulator, start, 1)
 
 
 def test_generated_files_are_up_to_date() -> None:
