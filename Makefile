@@ -8,7 +8,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install demo test test-slow lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
-	bench-simulator bench-tracking bench-paper bench-capture bench-sim2real clean
+	bench-simulator bench-tracking bench-paper bench-capture bench-sim2real bench-laws laws clean
 
 install: $(VENV)/installed $(VENV)/kernels
 
@@ -73,6 +73,14 @@ check-wheel: wheel
 # Tests that need the recordings and reference trajectories beside the checkout; skipped if they are absent.
 real: install
 	SHARED=$(SHARED) $(BIN)/pytest -m "real or reference" -rs
+
+# Elastic laws compared with tensile tests of silicone rubbers.
+bench-laws: install
+	$(BIN)/python tests/bench/laws.py $(SHARED)/real/rubber_tensile
+
+# The derivatives of the package's elastic laws, from their energies.
+laws: install
+	$(BIN)/python -m rafl.fem.laws.generated
 
 # The real beam with each recording held out in turn: baseline, system identification, RAFL.
 real-beam: install

@@ -26,6 +26,7 @@ from rafl.data.markers import Markers
 from rafl.data.objective import Recordings
 from rafl.data.synthetic import load_force
 from rafl.evaluation.metrics import compare, error_table
+from rafl.fem.laws import register_law
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.fitting.fit import fit
@@ -70,6 +71,7 @@ __all__ = [
     "read_dataset",
     "read_specimen",
     "read_tracks",
+    "register_law",
     "rollout",
     "simulate",
     "track",

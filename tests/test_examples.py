@@ -13,6 +13,7 @@ from support import ROOT, Run
 import rafl
 from rafl import api
 from rafl.capture.rendering.motion import tip_load_release
+from rafl.fem.laws import LAWS
 from rafl.tracking.reconstruction.tracks import STATES
 
 EXAMPLES = ROOT / "docs" / "examples"
@@ -83,7 +84,7 @@ def test_fit_and_predict(fitted: Path) -> None:
     assert len(table) == 1 + 20 * 20
 
 
-@pytest.mark.parametrize("example", ["gradient", "own_residual"])
+@pytest.mark.parametrize("example", ["gradient", "own_law", "own_residual"])
 def test_examples_with_the_simulator(
     fitted: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], example: str
 ) -> None:
@@ -91,6 +92,11 @@ def test_examples_with_the_simulator(
     names = runpy.run_path(str(EXAMPLES / f"{example}.py"))
     if example == "gradient":
         assert names["modulus"].grad > 0  # a stiffer beam hangs less
+    elif example == "own_law":
+        tip = names["tip"]
+        assert tip["gent"] == pytest.approx(tip["corotated"], abs=0.5)  # [mm]; equal at small strains
+        assert abs(tip["gent"] - tip["corotated"]).max() > 1e-3
+        del LAWS["gent"]
     else:
         lines = [line for line in capsys.readouterr().out.splitlines() if line.startswith("rate")]
         losses = [float(line.split("loss")[1].split()[0]) for line in lines]

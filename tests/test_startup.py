@@ -14,7 +14,7 @@ from rafl.simulation.time_integration import INTEGRATORS
 from rafl.tracking import cli as tracking_cli
 from rafl.tracking.reconstruction.export import WRITERS
 
-HEAVY = {"cv2", "h5py", "matplotlib", "numba", "numpy", "pandas", "scipy", "torch", "trimesh"}
+HEAVY = {"cv2", "h5py", "matplotlib", "numba", "numpy", "pandas", "scipy", "sympy", "torch", "trimesh"}
 PROGRAM = """
 import sys
 from importlib.metadata import entry_points
@@ -58,6 +58,13 @@ def test_help_imports_nothing_heavy(name: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("line", REFUSED, ids=" ".join)
 def test_refusal_imports_nothing_heavy(line: list[str], tmp_path: Path) -> None:
     assert not imported(line, tmp_path, 2) & HEAVY
+
+
+def test_laws_of_the_package_need_no_sympy(tmp_path: Path) -> None:
+    """Their derivatives are in files, so a simulation starts without it."""
+    program = "import sys; import rafl; rafl.Material(law='yeoh'); print('sympy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr
 
 
 def test_options_name_what_the_library_has() -> None:

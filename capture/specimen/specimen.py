@@ -6,12 +6,13 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from rafl.capture.specimen.geometry import Geometry
 from rafl.common.errors import InputError
 from rafl.common.yaml_files import StrictModel, read_yaml
 from rafl.data.markers import Markers, embed, embedding_gap
+from rafl.fem.laws import LAWS
 from rafl.fem.material import PRESET_INTEGRATORS, PRESETS, Material
 from rafl.fem.maxwell import branch_shares, branch_times
 from rafl.fem.mesh import HexMesh
@@ -24,6 +25,12 @@ DEFAULT_PRESET: Literal["paper", "physical"] = "physical"
 # three cells across then sag by 6 % too little, with the cut by 1 to 2 %. Shares of 0.25 to 0.35 do equally well.
 CLAMP_SPLIT = 0.3
 Face = Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
+
+
+def _known_law(name: str) -> str:
+    if name not in LAWS:
+        raise ValueError(f"Input should be one of {', '.join(LAWS)}")
+    return name
 
 
 class _Branch(StrictModel):
@@ -48,7 +55,7 @@ class _Material(StrictModel):
     poissons_ratio: float = Field(gt=-1, lt=0.5)
     density: float = Field(gt=0)
     preset: Literal["paper", "physical"] = DEFAULT_PRESET
-    law: Literal["projective", "corotated", "neo-hookean"] | None = None
+    law: Annotated[str, AfterValidator(_known_law)] | None = None
     mass: Literal["uniform", "lumped"] | None = None
     integration: Literal["full", "selective", "enhanced"] | None = None
     mass_damping: float = Field(default=0.0, ge=0)

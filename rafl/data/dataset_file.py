@@ -16,6 +16,7 @@ from rafl.common.version import VERSION
 from rafl.common.yaml_files import check_format
 from rafl.data.dataset import MAX_RELATIVE_TIME_ERROR, Dataset, Trajectory
 from rafl.data.markers import Markers
+from rafl.fem.laws import LAWS
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.simulator import Simulator
@@ -195,7 +196,8 @@ def read_dataset(path: str | Path) -> Dataset:
     """Read and check a dataset file.
 
     Raises:
-        InputError: no such file, not a dataset, a newer version, or a missing, damaged or inconsistent part.
+        InputError: no such file, not a dataset, a newer version, a missing, damaged or inconsistent part, or a material
+            whose law is not registered.
     """
     path = Path(path)
     require_file(path, "a dataset (.h5)")
@@ -212,10 +214,16 @@ def read_dataset(path: str | Path) -> Dataset:
 
 
 def _read(file: h5py.File) -> Dataset:
+    material = _attributes(file["material"])
+    if material["law"] not in LAWS:
+        raise InputError(
+            f"expected one of the laws {', '.join(LAWS)} in {file.filename}, found {material['law']!r}; "
+            "register it first, in Python, with rafl.register_law"
+        )
     gx, gy, gz = (float(g) for g in file.attrs["gravity"])
     simulator = Simulator(
         HexMesh(file["mesh/vertices"][()], file["mesh/hexes"][()]),
-        Material(**_attributes(file["material"])),
+        Material(**material),
         file["mesh/fixed"][()],
         float(file.attrs["time_step"]),
         (gx, gy, gz),

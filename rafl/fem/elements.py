@@ -29,17 +29,13 @@ from rafl.fem.kernel_layout import (
     U,
     V,
 )
-from rafl.fem.laws import corotated, neo_hookean, projective
+from rafl.fem.laws.kernel import fill_derivatives
 from rafl.fem.simd import KERNEL_OPTIONS, lane_products, transposed_product, weighted_rows
 from rafl.fem.svd import signed_svd_simd
 
 # Stored blocks of a cell's symmetric 24 x 24 stiffness: (component i, component k <= i), each 8 x 8 nodes.
 COMPONENT_BLOCKS = 6
 CELLS_PER_CHUNK = 16  # number of cells in one task of a thread
-
-_projective = projective.derivatives
-_corotated = corotated.derivatives
-_neo_hookean = neo_hookean.derivatives
 
 component_gradient = weighted_rows(8, 3, 24)  # sum over nodes of nodal value times gradient
 _add_nodal_force = weighted_rows(3, 8, 8, add=True)
@@ -238,12 +234,7 @@ def _add_cell(
         for j in range(3):
             component_gradient(w, (DEFORMATION + 3 * i + j) * 8, x, i, gradients_by_point, 8 * j)
     signed_svd_simd(w)
-    if law == 0:
-        _projective(w, mu, lam)
-    elif law == 1:
-        _corotated(w, mu, lam)
-    else:
-        _neo_hookean(w, mu, lam)
+    fill_derivatives(law, w, mu, lam)
     fill_stress(w)
     if tangent:
         if project:
@@ -310,7 +301,7 @@ def element_terms(
         gradients_by_node: the same in the order (E, G, 8 points * 3 * 8 nodes).
         volume: of each point [m^3], (E, G, 8).
         group_shares: fraction of mu and of lambda that each group of points integrates, (G, 2).
-        law: index of the elastic law in `LAWS`.
+        law: address of the elastic law's compiled derivatives, `rafl.fem.laws.law.Law.kernel.address`.
         moduli: see `rafl.fem.constitutive_state.MODULI`, (B, 5).
         viscous: whether viscous stress acts, with `memory`.
         memory: of the viscous stress [Pa], (B, E, 8 G, 6).

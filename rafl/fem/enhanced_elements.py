@@ -12,13 +12,9 @@ from numba import njit, prange
 
 from rafl.fem.elements import add_damping_stress, add_viscous_stress, fill_stress, fill_tangent, project_semidefinite
 from rafl.fem.kernel_layout import DEFORMATION, ENERGY, STRESS, STRETCH, TANGENT, WEIGHT, U, V
-from rafl.fem.laws import corotated, neo_hookean, projective
+from rafl.fem.laws.kernel import fill_derivatives
 from rafl.fem.simd import KERNEL_OPTIONS, lane_products
 from rafl.fem.svd import signed_svd_simd
-
-_projective = projective.derivatives
-_corotated = corotated.derivatives
-_neo_hookean = neo_hookean.derivatives
 
 COLUMNS = 7  # of the local tangent: three of the deformation gradient, four hourglass vectors
 _GROUPS_PER_CHUNK = 4  # groups of eight cells in one task of a thread
@@ -401,7 +397,7 @@ def enhanced_terms(
         hexes: (E, 8).
         columns: mean shape function gradients [1/m] and hourglass vectors of each lane, (G, 7 * 8 nodes * 8 lanes).
         volume: of the lanes' cells [m^3], zero in unused lanes, (G, 8).
-        law: index of the elastic law in `LAWS`.
+        law: address of the elastic law's compiled derivatives, `rafl.fem.laws.law.Law.kernel.address`.
         moduli: see `rafl.fem.constitutive_state.MODULI`, (B, 5).
         hourglass: elastic, viscous and damping stiffness by lane, (B, G or 1, 3, 144 * 8 lanes).
         per_shape: whether `hourglass` has one set for all groups.
@@ -447,12 +443,7 @@ def enhanced_terms(
                         lane_hourglass_memory[c, g] = hourglass_memory[t, e, c]
             _fill_kinematics(w, columns[group])
             signed_svd_simd(w)
-            if law == 0:
-                _projective(w, moduli[t, 0], moduli[t, 1])
-            elif law == 1:
-                _corotated(w, moduli[t, 0], moduli[t, 1])
-            else:
-                _neo_hookean(w, moduli[t, 0], moduli[t, 1])
+            fill_derivatives(law, w, moduli[t, 0], moduli[t, 1])
             fill_stress(w)
             if tangent:
                 if project:

@@ -43,7 +43,8 @@ class Material:
         mass: mass model. `lumped`: every node has its share of the adjacent cells' mass; the sum is the true mass.
             `uniform`: every node has rho times the mean cell volume, as in the paper's simulator. The sum is about
             twice the true mass of the paper's beams, and more on coarser meshes.
-        law: elastic law, one of `rafl.fem.laws.LAWS`.
+        law: elastic law: `projective`, `corotated`, `neo-hookean`, `yeoh`, `mooney-rivlin`, or one that you have
+            registered with `rafl.register_law`.
         integration: `full`: eight points per cell. `selective`: the lambda term sees the cell's mean
             strain only (B-bar), so nearly incompressible cells do not lock in volume. `enhanced`: the law sees each
             cell's mean deformation, and the hourglass modes have a stiffness that locks neither in volume nor in
@@ -74,7 +75,8 @@ class Material:
     def __post_init__(self) -> None:
         for key, known in (("mass", MASS_MODELS), ("law", tuple(LAWS)), ("integration", INTEGRATION_SCHEMES)):
             if getattr(self, key) not in known:
-                raise ValueError(f"expected {key} to be one of {', '.join(known)}, got {getattr(self, key)!r}")
+                advice = "; register a law of your own first (rafl.register_law)" if key == "law" else ""
+                raise ValueError(f"expected {key} to be one of {', '.join(known)}, got {getattr(self, key)!r}{advice}")
         if not (self.youngs_modulus > 0 and -1 < self.poissons_ratio < 0.5 and self.density > 0):
             raise ValueError(
                 "expected a Young's modulus and a density above 0 and a Poisson's ratio between -1 and 0.5, "

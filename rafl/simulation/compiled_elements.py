@@ -38,7 +38,7 @@ class PointElements:
 
     def __init__(self, mesh: HexMesh, law: str, rule: QuadratureRule) -> None:
         self.mesh, self.rule = mesh, rule
-        self.law = list(LAWS).index(law)
+        self.law = law
         cells, groups = len(mesh.hexes), len(rule.group_shares)
         gradient = rule.points.gradient.reshape(cells, groups, 8, 8, 3)  # (.., point, node, component)
         self._gradients_by_point = np.ascontiguousarray(gradient.transpose(0, 1, 3, 4, 2)).reshape(cells, groups, 192)
@@ -60,7 +60,7 @@ class PointElements:
             self._gradients_by_node,
             self._volume,
             self.rule.group_shares,
-            self.law,
+            LAWS[self.law].kernel.address,
             state.moduli,
             state.memory is not None,
             unused if state.memory is None else state.memory,
@@ -93,7 +93,7 @@ class EnhancedElements:
     def __init__(self, modes: HourglassModes, law: str) -> None:
         self.modes = modes
         self.mesh = mesh = modes.mesh
-        self.law = list(LAWS).index(law)
+        self.law = law
         count = len(mesh.hexes)
         groups = -(-count // SIMD_LANES)
         lanes = np.arange(groups * SIMD_LANES)
@@ -133,7 +133,7 @@ class EnhancedElements:
             self.mesh.hexes,
             self._columns,
             self._volume,
-            self.law,
+            LAWS[self.law].kernel.address,
             state.moduli,
             hourglass,
             hourglass.shape[1] == 1,

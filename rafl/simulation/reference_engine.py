@@ -49,7 +49,7 @@ class ReferenceEngine:
         self.mesh = mesh
         self.fixed = fixed
         self.integration = integration
-        self.law = LAWS[law]
+        self.law = law
         self.device = torch.device(device)
         self.quadrature = QuadratureRule.from_scheme(mesh, integration)
         points = self.quadrature.points
@@ -77,7 +77,7 @@ class ReferenceEngine:
         F = torch.einsum("beni,epnj->bepij", at_cells, self._gradient)
         U, s, V = signed_svd(F)
         mu, lam = (moduli[:, k, None, None] * self._shares[:, k] for k in (0, 1))  # (B, 1, P)
-        energy, first, second, flip = self.law.reference_derivatives(
+        energy, first, second, flip = LAWS[self.law].reference_derivatives(
             s, mu.expand(s.shape[:-1]), lam.expand(s.shape[:-1])
         )
         P = U @ torch.diag_embed(first) @ V.mT

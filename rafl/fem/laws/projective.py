@@ -141,7 +141,6 @@ def _upper_root(stretch, kappa):
     return 0.5 * (stretch + np.sqrt(stretch * stretch - 4.0 * kappa))
 
 
-@njit(**KERNEL_OPTIONS)
 def derivatives(w, mu, lam):
     """Fill ENERGY, FIRST, SECOND and FLIP from the stretches; see `rafl.fem.kernel_layout`.
 

@@ -36,6 +36,7 @@ def test_the_canonical_beam_matches_the_paper() -> None:
         ("name: La0", "name: Lb0", "more than once"),
         ("mass: lumped", "mass: heavy", "material.mass"),
         ("mass: lumped", "preset: fancy", "material.preset"),
+        ("mass: lumped", "law: jelly", "material.law: .* one of projective, .*yeoh.*, found 'jelly'"),
         ("mass: lumped", "viscosity: -1", "material.viscosity"),
         ("clamp:", "simulation: {substeps: 0}\nclamp:", "simulation.substeps"),
     ],
@@ -55,6 +56,7 @@ def test_errors_name_the_invalid_key(specimen_file: Path, old: str, new: str, pa
         (", preset: paper", "projective", "uniform"),
         (", preset: paper, mass: lumped", "projective", "lumped"),
         (", law: neo-hookean", "neo-hookean", "lumped"),
+        (", law: mooney-rivlin", "mooney-rivlin", "lumped"),
     ],
 )
 def test_explicit_options_override_the_preset(specimen_file: Path, options: str, law: str, mass: str) -> None:

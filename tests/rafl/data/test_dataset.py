@@ -6,10 +6,12 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from energies import gent
 
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
+from rafl.fem.laws import LAWS, register_law
 
 
 def test_written_dataset_is_read_back_unchanged(dataset: Dataset, tmp_path: Path) -> None:
@@ -57,6 +59,19 @@ def test_damaged_file_is_refused(dataset: Dataset, tmp_path: Path) -> None:
     path.write_bytes(content[: len(content) // 2])
     with pytest.raises(InputError, match="cannot be read"):
         read_dataset(path)
+
+
+def test_law_of_ones_own(dataset: Dataset, tmp_path: Path) -> None:
+    """The file stores the name of the law, which must be registered when it is read."""
+    register_law("gent", gent)
+    simulator = replace(dataset.simulator, material=replace(dataset.simulator.material, law="gent"))
+    path = tmp_path / "dataset.h5"
+    write_dataset(path, replace(dataset, simulator=simulator))
+    assert read_dataset(path).simulator.material == simulator.material
+    del LAWS["gent"]
+    with pytest.raises(InputError, match=r"laws projective, .* in .*dataset.h5, found 'gent'; register it first"):
+        read_dataset(path)
+    assert damaged_parts(path) == []
 
 
 def test_empty_dataset_is_refused(dataset: Dataset, tmp_path: Path) -> None:
