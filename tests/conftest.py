@@ -37,8 +37,9 @@ COMMANDS.set_forkserver_preload(["support", "rafl.capture.commands", "rafl.comma
 SMALL = """format: rafl-specimen/1
 name: small
 geometry: {box_mm: [60, 20, 20], element_mm: 10}
-material: {youngs_modulus: 150000, poissons_ratio: 0.4, density: 1070, mass: lumped}
+material: {youngs_modulus: 150000, poissons_ratio: 0.4, density: 1070, mass: lumped, integration: full}
 clamp: {face: x-min}
+simulation: {integrator: implicit-euler}
 markers:
 """
 

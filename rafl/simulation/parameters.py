@@ -45,6 +45,11 @@ class Parameters:
         """Whether stiffness damping is non-zero or requires a gradient."""
         return _acts(self.stiffness_damping)
 
+    @property
+    def damped(self) -> bool:
+        """Whether viscous stress or stiffness damping acts."""
+        return self.viscous or self.stiffness_damped
+
     def rest_lame(self, law: str, batch: int) -> tuple[Tensor, Tensor]:
         """Lame parameters mu and lambda of the law's linearisation at rest [Pa], (B) each."""
         mu, lam = LAWS[law].rest_lame(*lame(self.youngs_modulus, self.poissons_ratio))
