@@ -35,7 +35,8 @@ def branch_shares(tan_delta: Tensor, from_hz: float, to_hz: float) -> Tensor:
     loss, storage = x / (1.0 + x**2), x**2 / (1.0 + x**2)
     rows = loss - tan_delta[..., None, None] * storage
     right = (rows.mT @ tan_delta[..., None, None].expand(*rows.shape[:-1], 1))[..., 0]
-    return torch.linalg.solve(rows.mT @ rows, right)
+    shares: Tensor = torch.linalg.solve(rows.mT @ rows, right)
+    return shares
 
 
 def complex_modulus(shares: Tensor, times: Tensor, frequency: Tensor) -> tuple[Tensor, Tensor]:

@@ -63,9 +63,9 @@ class Quantity:
     Attributes:
         name: in `rafl.simulation.parameters.Parameters`, `tan_delta`, or `branch_share_1` and so on.
         low, high: bounds.
-        kind: the variable is, for a value p, `log`: log p; `gap`: log (1/2 - p); `root`: the square root of p / scale.
+        kind: the variable is, for a value p, `log`: log p; `gap`: log (1/2 - p); `linear`: p / scale.
         unit: for messages.
-        scale: of `root`, in the unit of the value.
+        scale: of `linear`, in the unit of the value.
         start: value to start from if the assumed material has none, or less.
     """
 
@@ -81,14 +81,14 @@ class Quantity:
         """The variable of a value."""
         if self.kind == "log":
             return float(np.log(value))
-        return float(np.log(0.5 - value)) if self.kind == "gap" else float(np.sqrt(value / self.scale))
+        return float(np.log(0.5 - value)) if self.kind == "gap" else value / self.scale
 
     def value(self, variable: Any) -> Any:
         """The value of a variable, a float or a tensor."""
         exp = torch.exp if isinstance(variable, Tensor) else np.exp
         if self.kind == "log":
             return exp(variable)
-        return 0.5 - exp(variable) if self.kind == "gap" else self.scale * variable**2
+        return 0.5 - exp(variable) if self.kind == "gap" else self.scale * variable
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -99,12 +99,12 @@ class Quantity:
 
 MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa")
 POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "gap", "")
-VISCOSITY = Quantity("viscosity", 0.0, 1e4, "root", "Pa s", scale=100.0, start=100.0)
-LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "root", "", scale=0.1, start=0.1)
+VISCOSITY = Quantity("viscosity", 0.0, 1e4, "linear", "Pa s", scale=100.0, start=100.0)
+LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "linear", "", scale=0.1, start=0.1)
 LOSS_FREQUENCIES = (0.5, 50.0)  # [Hz]; from the slowest swings of large specimens to half of 100 frames/s
 BRANCH_TIMES = branch_times(*LOSS_FREQUENCIES)  # [s]
 SHARES = tuple(
-    Quantity(f"branch_share_{k + 1}", 0.0, 1.0, "root", "", scale=0.1, start=0.05) for k in range(len(BRANCH_TIMES))
+    Quantity(f"branch_share_{k + 1}", 0.0, 1.0, "linear", "", scale=0.1, start=0.05) for k in range(len(BRANCH_TIMES))
 )
 METHOD_QUANTITIES = {
     "sysid": (MODULUS, POISSON),

@@ -201,7 +201,7 @@ def _by_moduli(engine: Engine, q: Array, state: ConstitutiveState, adjoint: Arra
 def _viscous_weights(engine: Engine) -> Array:
     """Twice the volume of every integration point times the multiplicity of its strains, (E, 6 P)."""
     points, shares = engine.quadrature.points, engine.quadrature.point_shares[:, 0]
-    weights = 2.0 * (points.volume * shares)[..., None] * MULTIPLICITY
+    weights: Array = 2.0 * (points.volume * shares)[..., None] * MULTIPLICITY
     return weights.reshape(len(weights), -1)
 
 
@@ -240,10 +240,8 @@ def _by_shape(engine: Engine, left: Array, right: Array) -> Array:
     """Outer products of left and right (B, E, 12), summed over the cells of each shape, (B, U, 12, 12)."""
     index = engine.hourglass_modes.shape_index
     out = np.zeros((len(left), int(index.max()) + 1, MODES, MODES))
-    if out.shape[1] == 1:
-        np.einsum("bec,bed->bcd", left, right, out=out[:, 0])
-    else:
-        np.add.at(out, (slice(None), index), left[..., :, None] * right[..., None, :])
+    for shape in range(out.shape[1]):
+        out[:, shape] = np.einsum("bec,bed->bcd", left[:, index == shape], right[:, index == shape])
     return out
 
 

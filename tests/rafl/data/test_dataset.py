@@ -16,7 +16,13 @@ from rafl.fem.laws import LAWS, register_law
 
 def test_written_dataset_is_read_back_unchanged(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
-    material = replace(dataset.simulator.material, viscosity=12.0, integration="selective")
+    material = replace(
+        dataset.simulator.material,
+        viscosity=12.0,
+        integration="selective",
+        branch_shares=(0.1, 0.2),
+        branch_times=(0.01, 0.5),
+    )
     simulator = replace(dataset.simulator, material=material, integrator="generalised-alpha", substeps=3)
     dataset = replace(dataset, simulator=simulator)
     write_dataset(path, dataset)

@@ -122,6 +122,25 @@ def test_gradients(
     assert torch.autograd.gradcheck(loss, leaves, eps=1e-6, atol=1e-4, rtol=1e-4, fast_mode=True)
 
 
+def test_gradients_by_the_material_of_distorted_cells(random: np.random.Generator) -> None:
+    """Every cell has a hourglass stiffness of its own, which depends on E, nu and the damping."""
+    mesh = HexMesh(MESH.vertices + random.uniform(-2e-3, 2e-3, MESH.vertices.shape), MESH.hexes)
+    material = Material(1e5, 0.4, mass="lumped", law="corotated", integration="enhanced")
+    simulator = Simulator(mesh, material, FIXED, integrator="generalised-alpha")
+    q = torch.tensor(mesh.vertices + random.normal(0, 1e-3, (2, *mesh.vertices.shape)))
+    weights = torch.tensor(random.normal(size=q.shape))
+
+    def loss(e: Tensor, nu: Tensor, viscosity: Tensor, damping: Tensor, shares: Tensor) -> Tensor:
+        own = {"youngs_modulus": 1e5 * e, "poissons_ratio": nu, "viscosity": 100.0 * viscosity}
+        own |= {"stiffness_damping": 1e-2 * damping, "branch_shares": shares, "branch_times": torch.tensor([0.01, 0.1])}
+        parameters = simulator.parameters(**own)
+        return 100.0 * (weights * rollout(simulator, start_of(q), 3, parameters=parameters)[0][-1]).sum()
+
+    values = ([1.0, 2.0], [0.4, 0.45], 0.2, 0.3, [0.1, 0.3])
+    leaves = [torch.tensor(value, dtype=torch.float64, requires_grad=True) for value in values]
+    assert torch.autograd.gradcheck(loss, leaves, eps=1e-6, atol=1e-4, rtol=1e-4, fast_mode=True)
+
+
 @pytest.mark.parametrize(("law", "integration"), [*((law, "full") for law in LAWS), ("corotated", "enhanced")])
 def test_gradients_of_the_equilibrium(law: str, integration: str, random: np.random.Generator) -> None:
     simulator = simulator_of(law=law, integration=integration)
