@@ -9,7 +9,7 @@ from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 
-METHODS = ("rafl", "srl", "sysid", "sysid-e", "sysid-damping")
+METHODS = ("rafl", "srl", "sysid", "sysid-e", "sysid-damping", "sysid-loss", "sysid-branches")
 INTEGRATORS = ("implicit-euler", "generalised-alpha")
 DATASET = "a dataset (.h5, written by rafl-capture)"
 
@@ -25,7 +25,8 @@ def fit(
         str,
         typer.Option(
             help="rafl: residual field; srl: supervised baseline; sysid: E and nu, sysid-e: E at nu = 0.499, "
-            "sysid-damping: E, nu and viscosity."
+            "sysid-damping: E, nu and viscosity, sysid-loss: E, nu and loss factor, sysid-branches: E, nu, viscosity and "
+            "Maxwell branches."
         ),
     ] = "rafl",
     out: Annotated[Path | None, typer.Option(help="Run folder [runs/DATASET-METHOD].")] = None,

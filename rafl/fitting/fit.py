@@ -41,7 +41,8 @@ def fit(
         datasets: dataset files, or one.
         run: folder for model.pt, history.csv, config.yaml and the checkpoint; must not hold a run yet.
         method: `rafl` (residual acceleration field), `srl` (supervised baseline), `sysid` (E and nu), `sysid-e` (E at
-            nu = 0.499) or `sysid-damping` (E, nu and viscosity).
+            nu = 0.499), `sysid-damping` (E, nu and viscosity), `sysid-loss` (E, nu and loss factor) or `sysid-branches`
+            (E, nu, viscosity and Maxwell branches).
         resume: continue the interrupted run in the folder; the settings must be the same.
         report: called with every row of the history.
         notify: called with a message for every setting that has no effect.
