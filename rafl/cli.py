@@ -25,8 +25,8 @@ def fit(
         str,
         typer.Option(
             help="rafl: residual field; srl: supervised baseline; sysid: E and nu, sysid-e: E at nu = 0.499, "
-            "sysid-damping: E, nu and viscosity, sysid-loss: E, nu and loss factor, sysid-branches: E, nu, viscosity and "
-            "Maxwell branches."
+            "sysid-damping: E, nu and viscosity, sysid-loss: E, nu and loss factor, "
+            "sysid-branches: E, nu, viscosity and Maxwell branches."
         ),
     ] = "rafl",
     out: Annotated[Path | None, typer.Option(help="Run folder [runs/DATASET-METHOD].")] = None,

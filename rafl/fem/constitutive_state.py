@@ -15,7 +15,7 @@ VISCOUS, DAMPING = 2, (3, 4)  # columns
 
 @dataclass(frozen=True)
 class HourglassStiffness:
-    """Stiffness of the hourglass modes of every shape of cell, see `rafl.fem.hourglass`; all (B, U, 12, 12).
+    """Stiffness of the hourglass modes of every shape of cell, see `rafl.fem.enhanced.hourglass`; all (B, U, 12, 12).
 
     Attributes:
         elastic: [N/m].

@@ -48,7 +48,7 @@ class Material:
         integration: `full`: eight points per cell. `selective`: the lambda term sees the cell's mean
             strain only (B-bar), so nearly incompressible cells do not lock in volume. `enhanced`: the law sees each
             cell's mean deformation, and the hourglass modes have a stiffness that locks neither in volume nor in
-            bending, see `rafl.fem.hourglass`.
+            bending, see `rafl.fem.enhanced.hourglass`.
         mass_damping: Rayleigh coefficient alpha [1/s]; the damping force is alpha M v.
         stiffness_damping: Rayleigh coefficient beta [s]; the damping force is beta K v, with K the stiffness
             at rest. It also damps rigid rotation; use `viscosity` for large rotations.

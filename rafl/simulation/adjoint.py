@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rafl.fem.constitutive_state import DAMPING, VISCOUS, ConstitutiveState, HourglassStiffness
-from rafl.fem.hourglass import MODES
+from rafl.fem.enhanced.hourglass import MODES
 from rafl.fem.strain import MULTIPLICITY, scatter
 from rafl.simulation.engine import Engine
 from rafl.simulation.simulator import Simulator

@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 
 from rafl.fem.constitutive_state import ConstitutiveState, HourglassStiffness
 from rafl.fem.elements import element_terms
-from rafl.fem.enhanced_elements import enhanced_measures, enhanced_measures_adjoint, enhanced_terms
-from rafl.fem.hourglass import MODES, HourglassModes
+from rafl.fem.enhanced.hourglass import MODES, HourglassModes
+from rafl.fem.enhanced.strains import enhanced_strains, enhanced_strains_adjoint
+from rafl.fem.enhanced.terms import enhanced_terms
 from rafl.fem.laws import LAWS
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule
@@ -154,12 +155,12 @@ class EnhancedElements:
     def strains(self, q: Array, direction: Array) -> tuple[Array, Array]:
         """Green strains, then hourglass vectors, and their change along a direction."""
         out = [np.empty((len(q), len(self.mesh.hexes), size)) for size in (6, MODES, 6, MODES)]
-        enhanced_measures(q, direction, self._cells, self.mesh.hexes, self._columns, self._volume, *out)
+        enhanced_strains(q, direction, self._cells, self.mesh.hexes, self._columns, self._volume, *out)
         return np.concatenate(out[:2], axis=-1), np.concatenate(out[2:], axis=-1)
 
     def strains_adjoint(self, q: Array, by_strain: Array) -> Array:
         """Derivative of the weighted sum of the strains."""
         out = np.empty_like(q)
         parts = np.ascontiguousarray(by_strain[..., :6]), np.ascontiguousarray(by_strain[..., 6:])
-        enhanced_measures_adjoint(q, *parts, self._cells, self.mesh.hexes, self._columns, self._volume, out)
+        enhanced_strains_adjoint(q, *parts, self._cells, self.mesh.hexes, self._columns, self._volume, out)
         return out

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.fem.elements import multiply
-from rafl.fem.hourglass import HourglassModes
+from rafl.fem.enhanced.hourglass import HourglassModes
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule
 from rafl.simulation.compiled_elements import CompiledElements, EnhancedElements, PointElements

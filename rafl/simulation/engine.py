@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.fem.constitutive_state import ConstitutiveState
-from rafl.fem.hourglass import HourglassModes
+from rafl.fem.enhanced.hourglass import HourglassModes
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule
 from rafl.solvers.linear import Factors

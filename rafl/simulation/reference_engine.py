@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rafl.fem.constitutive_state import ConstitutiveState
-from rafl.fem.hourglass import MODES, HourglassModes
+from rafl.fem.enhanced.hourglass import MODES, HourglassModes
 from rafl.fem.laws import LAWS
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule

@@ -1,10 +1,10 @@
-"""Hourglass terms of `enhanced` integration in plain, differentiable tensors; see `rafl.fem.hourglass`."""
+"""Hourglass terms of `enhanced` integration in plain, differentiable tensors; see `rafl.fem.enhanced.hourglass`."""
 
 import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from rafl.fem.hourglass import MODES
+from rafl.fem.enhanced.hourglass import MODES
 
 
 def _cross_matrix(v: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ Piola-Kirchhoff stress 2 G A, where dA/dt = dE/dt - A / tau and E is the Green s
 
 exactly (Taylor, Pister and Goudreau, 1970). Viscosity eta adds 2 eta dE/dt, by the second-order backward difference of
 the last three strains. All together add 2 (g E - memory) with one modulus g and one memory per strain, however many
-branches there are. The same holds for the hourglass vectors of `rafl.fem.hourglass` in the place of E.
+branches there are. The same holds for the hourglass vectors of `rafl.fem.enhanced.hourglass` in the place of E.
 
 The strains are those at the solutions of the steps, which lie `Integrator.fraction` of a step after its start.
 """

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rafl.fem.hourglass import HourglassModes
+from rafl.fem.enhanced.hourglass import HourglassModes
 from rafl.fem.laws import LAWS
 from rafl.fem.material import Material, lame
 from rafl.fem.mesh import HexMesh

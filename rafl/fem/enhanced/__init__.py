@@ -1,0 +1,1 @@
+"""Cells with one integration point and stabilised hourglass modes."""
