@@ -6,6 +6,7 @@ Times are medians of one run. FOLDER may contain `fishtail_fine_cells.npy`, a me
 """
 
 import argparse
+import itertools
 import json
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from scipy.linalg import cholesky_banded
 from threadpoolctl import threadpool_limits
 from torch import Tensor
 
+from rafl.capture.specimen.specimen import CLAMP_SPLIT
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.rollout import Start, rollout
@@ -150,6 +152,51 @@ def print_speed(folder: Path | None) -> None:
             )
 
 
+def physical_variants(mesh: HexMesh, nu: float) -> dict[str, Case]:
+    """A specimen of preset physical with every integration scheme, and with viscosity and branches."""
+    own = {"law": "corotated", "mass": "lumped"}
+    cut = mesh.split_layer(mesh.face_nodes("x-min"), CLAMP_SPLIT)
+    branches = {"branch_shares": (0.06, 0.06, 0.06), "branch_times": (0.01, 0.1, 1.0)}
+    variants = {
+        "full": (mesh, Material(130e3, nu, **own)),
+        "selective": (mesh, Material(130e3, nu, integration="selective", **own)),
+        "enhanced": (mesh, Material(130e3, nu, integration="enhanced", **own)),
+        "enhanced, cut": (cut, Material(130e3, nu, integration="enhanced", **own)),
+        "viscosity": (cut, Material(130e3, nu, integration="enhanced", viscosity=50.0, **own)),
+        "three branches": (cut, Material(130e3, nu, integration="enhanced", **branches, **own)),
+    }
+    cases = {}
+    for name, (each, material) in variants.items():
+        simulator = Simulator(each, material, each.face_nodes("x-min"), integrator="generalised-alpha")
+        force = simulator.weight[None].copy()
+        tip = each.face_nodes("x-max")
+        force[:, tip, 2] -= 0.02 * 9.80709 / len(tip)
+        cases[name] = Case(simulator, Start.at_rest(torch.from_numpy(simulator.equilibrium(force))))
+    return cases
+
+
+def print_integration() -> None:
+    """Times of the schemes relative to `full`, and of three branches relative to viscosity, interleaved."""
+    print("\nphysical specimens under generalised-alpha: time per step; ratios to `full`, of branches to viscosity")
+    print(f"{'mesh':>16s} {'nu':>6s} {'material':>15s} {'forward':>10s} {'ratio':>6s} {'backward':>10s} {'ratio':>6s}")
+    meshes = {
+        "canonical": canonical_mesh(),
+        "thicker": HexMesh.box((10, 4, 4), (0.1, 0.04, 0.04)),
+        "crude fish-tail": crude_fishtail_mesh(),
+    }
+    for (name, mesh), nu in itertools.product(meshes.items(), (0.45, 0.499)):
+        cases = physical_variants(mesh, nu)
+        rounds = [{key: case.step_times(40, 1) for key, case in cases.items()} for _ in range(5)]
+        times = {key: np.median([each[key] for each in rounds], axis=0) for key in cases}
+        for key, (forward, backward) in times.items():
+            base = times["viscosity" if key == "three branches" else "full"]
+            print(
+                f"{name:>16s} {nu:6.3f} {key:>15s} {forward:7.2f} ms {forward / base[0]:6.2f} {backward:7.2f} ms "
+                f"{backward / base[1]:6.2f}",
+                flush=True,
+            )
+
+
 def peak_memory() -> float:
     """Largest resident memory of this process since `reset_peak_memory` [MB]; Linux only."""
     status = Path("/proc/self/status").read_text()
@@ -207,8 +254,13 @@ def print_batches() -> None:
             print(f"{batch:7d} {threads:8d} {forward:9.2f} ms {backward:9.2f} ms", flush=True)
 
 
-def rollout_memory() -> dict[str, float]:
+def rollout_memory(remembering: bool) -> dict[str, float]:
+    """Peak memory of a rollout and its backward pass, of a specimen of preset physical with three branches or paper."""
     case = Case.released(canonical_mesh(), ORIGINAL_MATERIAL, 9)
+    if remembering:
+        own = physical_variants(canonical_mesh(), 0.499)["three branches"]
+        q = own.start.q.expand(9, -1, -1).contiguous()
+        case = Case(own.simulator, Start.at_rest(q))
     case.step_times(2, 1)
     before = reset_peak_memory()
     case.step_times(150, 1)
@@ -219,7 +271,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, nargs="?", help="folder with fishtail_fine_cells.npy")
     parser.add_argument("--grow", type=int, help="print one row of the growth table, for this refinement, as JSON")
-    parser.add_argument("--memory", action="store_true", help="print the peak memory of a long rollout as JSON")
+    parser.add_argument("--memory", choices=["paper", "branches"], help="print the peak memory of a rollout as JSON")
+    parser.add_argument("--integration", action="store_true", help="only compare integration schemes and branches")
     options = parser.parse_args()
     torch.set_num_threads(1)
     numba.set_num_threads(min(2, numba.config.NUMBA_NUM_THREADS))
@@ -227,13 +280,20 @@ def main() -> None:
         print(json.dumps(growth_row(options.grow)))
         return
     if options.memory:
-        print(json.dumps(rollout_memory()))
+        print(json.dumps(rollout_memory(options.memory == "branches")))
+        return
+    if options.integration:
+        print_integration()
         return
     print(f"unit of time (banded Cholesky, 480 x 480, bandwidth 65, one thread): {cholesky_time():.3f} ms")
     print_speed(options.folder)
     print_batches()
-    memory = run_in_subprocess("--memory")
-    print(f"\npeak memory of 150 steps of a batch of 9 and their backward pass: {memory['rollout_mb']:.0f} MB")
+    for kind in ("paper", "branches"):
+        memory = run_in_subprocess("--memory", kind)
+        print(
+            f"\npeak memory of 150 steps of a batch of 9 and their backward pass, {kind}: {memory['rollout_mb']:.0f} MB"
+        )
+    print_integration()
     print_growth()
 
 
