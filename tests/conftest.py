@@ -39,7 +39,7 @@ name: small
 geometry: {box_mm: [60, 20, 20], element_mm: 10}
 material: {youngs_modulus: 150000, poissons_ratio: 0.4, density: 1070, mass: lumped, integration: full}
 clamp: {face: x-min}
-simulation: {integrator: implicit-euler}
+simulation: {integrator: implicit-euler, substeps: 1}
 markers:
 """
 

@@ -13,7 +13,7 @@ from rafl.common.errors import InputError
 from rafl.common.yaml_files import StrictModel, read_yaml
 from rafl.data.markers import Markers, embed, embedding_gap
 from rafl.fem.laws import LAWS
-from rafl.fem.material import PRESET_INTEGRATORS, PRESETS, Material
+from rafl.fem.material import PRESET_TIME_INTEGRATION, PRESETS, Material
 from rafl.fem.maxwell import branch_shares, branch_times
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.simulator import Simulator
@@ -85,7 +85,7 @@ class _Material(StrictModel):
 
 class _Simulation(StrictModel):
     integrator: Literal["implicit-euler", "generalised-alpha"] | None = None
-    substeps: int = Field(default=1, ge=1)
+    substeps: int | None = Field(default=None, ge=1)
 
 
 class _Clamp(StrictModel):
@@ -184,6 +184,7 @@ def read_specimen(path: str | Path) -> Specimen:
     split = content.clamp.split
     if split is None:
         split = CLAMP_SPLIT if material.integration == "enhanced" else 0.0
+    integrator, substeps = PRESET_TIME_INTEGRATION[content.material.preset]
     if split:
         mesh = mesh.split_layer(mesh.face_nodes(content.clamp.face), split)
     return Specimen(
@@ -195,7 +196,7 @@ def read_specimen(path: str | Path) -> Specimen:
         MarkerLayout.of(content.markers),
         MarkerLayout.of(content.clamp.markers),
         path.read_text(encoding="utf-8"),
-        content.simulation.integrator or PRESET_INTEGRATORS[content.material.preset],
-        content.simulation.substeps,
+        content.simulation.integrator or integrator,
+        content.simulation.substeps or substeps,
         solid.volume,
     )

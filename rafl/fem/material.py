@@ -17,8 +17,9 @@ PRESETS: dict[str, dict[str, str]] = {
     "paper": {"law": "projective", "mass": "uniform"},
     "physical": {"law": "corotated", "mass": "lumped", "integration": "enhanced"},
 }
-# Time integration of a simulator of either preset, see `rafl.simulation.time_integration.INTEGRATORS`.
-PRESET_INTEGRATORS = {"paper": "implicit-euler", "physical": "generalised-alpha"}
+# Time integration of a simulator of either preset: one of `rafl.simulation.time_integration.INTEGRATORS`, and the steps
+# per frame. With one step of 10 ms generalised-alpha swings a mode of 8 Hz too slowly by 3 %, with two by less than 1 %.
+PRESET_TIME_INTEGRATION = {"paper": ("implicit-euler", 1), "physical": ("generalised-alpha", 2)}
 
 
 def lame(youngs_modulus: Any, poissons_ratio: Any) -> tuple[Any, Any]:

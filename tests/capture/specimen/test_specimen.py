@@ -38,7 +38,7 @@ def test_the_canonical_beam_matches_the_paper() -> None:
         ("mass: lumped", "preset: fancy", "material.preset"),
         ("mass: lumped", "law: jelly", "material.law: .* one of projective, .*yeoh.*, found 'jelly'"),
         ("mass: lumped", "viscosity: -1", "material.viscosity"),
-        ("integrator: implicit-euler", "substeps: 0", "simulation.substeps"),
+        ("substeps: 1", "substeps: 0", "simulation.substeps"),
         ("face: x-min", "face: x-min, split: 1.0", "clamp.split"),
         ("mass: lumped", "loss: {tan_delta: 0.1, from_hz: 50, to_hz: 5}", "material.loss: .*from_hz below to_hz"),
         ("mass: lumped", "branches: [{modulus_share: 0.1, time_s: 0}]", "material.branches.0.time_s"),
@@ -69,23 +69,29 @@ def test_errors_name_the_invalid_key(specimen_file: Path, old: str, new: str, pa
 )
 def test_explicit_options_override_the_preset(specimen_file: Path, options: str, law: str, mass: str) -> None:
     text = specimen_file.read_text().replace(", mass: lumped", f"{options}, viscosity: 30")
-    specimen_file.write_text(text.replace("integrator: implicit-euler", "integrator: generalised-alpha, substeps: 2"))
+    specimen_file.write_text(text.replace("implicit-euler, substeps: 1", "generalised-alpha, substeps: 3"))
     specimen = read_specimen(specimen_file)
     assert (specimen.material.law, specimen.material.mass, specimen.material.viscosity) == (law, mass, 30.0)
     simulator = specimen.simulator(0.01)
-    assert (simulator.integrator, simulator.substeps) == ("generalised-alpha", 2)
+    assert (simulator.integrator, simulator.substeps) == ("generalised-alpha", 3)
 
 
 @pytest.mark.parametrize(
-    ("preset", "integration", "integrator", "layers"),
-    [("physical", "enhanced", "generalised-alpha", 8), ("paper", "full", "implicit-euler", 7)],
+    ("preset", "integration", "integrator", "substeps", "layers"),
+    [("physical", "enhanced", "generalised-alpha", 2, 8), ("paper", "full", "implicit-euler", 1, 7)],
 )
-def test_presets(specimen_file: Path, preset: str, integration: str, integrator: str, layers: int) -> None:
+def test_presets(
+    specimen_file: Path, preset: str, integration: str, integrator: str, substeps: int, layers: int
+) -> None:
     """Preset physical cuts the first cell at the clamp in two, so that there is one more layer of nodes."""
-    text = specimen_file.read_text().replace("simulation: {integrator: implicit-euler}\n", "")
+    text = specimen_file.read_text().replace("simulation: {integrator: implicit-euler, substeps: 1}\n", "")
     specimen_file.write_text(text.replace("mass: lumped, integration: full", f"preset: {preset}"))
     specimen = read_specimen(specimen_file)
-    assert (specimen.material.integration, specimen.integrator) == (integration, integrator)
+    assert (specimen.material.integration, specimen.integrator, specimen.substeps) == (
+        integration,
+        integrator,
+        substeps,
+    )
     along = np.unique(np.round(specimen.mesh.vertices[:, 0], 9))
     assert len(along) == layers
     assert along[1] == pytest.approx(0.003 if layers == 8 else 0.01)
