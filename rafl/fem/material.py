@@ -18,7 +18,7 @@ PRESETS: dict[str, dict[str, str]] = {
     "physical": {"law": "corotated", "mass": "lumped", "integration": "enhanced"},
 }
 # Time integration of a simulator of either preset: one of `rafl.simulation.time_integration.INTEGRATORS`, and the steps
-# per frame. With one step of 10 ms generalised-alpha swings a mode of 8 Hz too slowly by 3 %, with two by less than 1 %.
+# per frame. With one step of 10 ms a mode of 8 Hz swings too slowly by 3 %, with two steps by less than 1 %.
 PRESET_TIME_INTEGRATION = {"paper": ("implicit-euler", 1), "physical": ("generalised-alpha", 2)}
 
 
