@@ -8,7 +8,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install demo test test-slow lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
-	bench-simulator bench-tracking bench-paper bench-capture bench-sim2real bench-laws bench-mesh laws clean
+	bench-simulator bench-tracking bench-paper bench-capture bench-sim2real bench-labs bench-laws bench-mesh laws clean
 
 install: $(VENV)/installed $(VENV)/kernels
 
@@ -109,6 +109,10 @@ bench-paper: install
 # The sim-to-real study with a stricter simulator as the laboratory. As long; QUICK=1 runs a short form.
 bench-sim2real: install
 	$(BIN)/python tests/bench/sim2real.py $(if $(QUICK),--quick,--results datasets/results)
+
+# Materials identified in two stand-in laboratories and carried to other shapes. Hours, resumable; QUICK=1 as well.
+bench-labs: install
+	$(BIN)/python tests/bench/labs.py $(if $(QUICK),--quick)
 
 # The specimens' meshes compared with converged solutions.
 bench-mesh: install

@@ -1,146 +1,161 @@
-"""Presets of the baseline simulator compared with the real beam, before and after identifying E, nu and viscosity.
+"""Frequency, damping and static drop of the real beam, simulated with each preset, law and identification method.
 
-    python tests/bench/presets.py ../shared/real/clamped_beam --out build/presets
+    python tests/bench/presets.py ../shared/real/clamped_beam --out build/presets [--only physical]
 
-Prints the frequency, damping ratio and static deflection of the tip, recorded and simulated, and the marker error.
+One material for all three recordings: that of the specimen file (`assumed`), or the one identified from all of them.
+How the recordings are used, see `beam_recordings.py`. The marker error is the mean distance in the plane of the swing.
 Resumable: results under --out are not computed again.
 """
 
 import argparse
-from dataclasses import replace
+import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 import torch
-from scipy.optimize import curve_fit
+import yaml
+from beam_recordings import BeamRecording, fit_history, moving_dataset, read_beam
 
-from rafl.capture.dataset.build import CaptureSettings, build_dataset
-from rafl.capture.dataset.table import read_recording_rows
-from rafl.capture.registration.registration import RestPose
-from rafl.capture.specimen.specimen import read_specimen
+from rafl.capture.specimen.specimen import Specimen, read_specimen
+from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.data.objective import Recordings, frame_errors
-from rafl.fem.material import Material
-from rafl.fitting.run_folder import Settings
-from rafl.fitting.sysid import identify_material
+from rafl.data.objective import Recordings
+from rafl.evaluation.oscillation import fit_oscillation
+from rafl.fitting.run_folder import FittedModel, Settings
+from rafl.fitting.sysid import identify_material, parameter_sentences
 from rafl.simulation.rollout import equilibrium
 
 SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
-REST = RestPose("beam_gravity_V2_b", 65, 65)  # recording and frame in which the beam is held straight
-IDENTIFICATION_FRAMES = 100  # leading frames that identification simulates
-
-CONFIGURATIONS: list[tuple[str, str, int, dict[str, Any]]] = [  # name, integrator, substeps, material
-    ("paper", "implicit-euler", 1, {"law": "projective", "mass": "uniform"}),
-    ("paper", "generalised-alpha", 1, {"law": "projective", "mass": "uniform"}),
-    ("projective, lumped", "implicit-euler", 1, {"law": "projective", "mass": "lumped"}),
-    ("physical", "implicit-euler", 1, {"law": "corotated", "mass": "lumped"}),
-    ("physical", "implicit-euler", 4, {"law": "corotated", "mass": "lumped"}),
-    ("physical", "generalised-alpha", 1, {"law": "corotated", "mass": "lumped"}),
-    ("physical, selective", "generalised-alpha", 1, {"law": "corotated", "mass": "lumped", "integration": "selective"}),
-    ("neo-Hookean, lumped", "generalised-alpha", 1, {"law": "neo-hookean", "mass": "lumped"}),
+ASSUMED = "assumed"
+METHODS = ("sysid-damping", "sysid-loss", "sysid-branches")
+# Name; entries that replace those of `material` in the specimen file; methods.
+CONFIGURATIONS: list[tuple[str, dict[str, str], tuple[str, ...]]] = [
+    ("paper", {"preset": "paper"}, (ASSUMED, "sysid-damping")),
+    ("physical, full", {"integration": "full"}, ("sysid-damping",)),
+    ("physical, selective", {"integration": "selective"}, ("sysid-damping",)),
+    ("physical", {}, (ASSUMED, *METHODS)),
+    ("physical, neo-hookean", {"law": "neo-hookean"}, METHODS),
+    ("physical, yeoh", {"law": "yeoh"}, METHODS),
 ]
+IDENTIFICATION_FRAMES, EPOCHS = 80, 13
+HISTORY_METHODS = ("sysid-loss", "sysid-branches")
 
 
-def frequency_and_damping(time: np.ndarray, z: np.ndarray) -> tuple[float, float]:
-    """Frequency [Hz] and damping ratio of the tip, from the least-squares fit of c + a e^(-d t) cos(w t + p)."""
-
-    def model(t: np.ndarray, c: float, a: float, d: float, w: float, p: float) -> np.ndarray:
-        return c + a * np.exp(-d * t) * np.cos(w * t + p)
-
-    oscillation = z - z[len(z) // 2 :].mean()
-    spectrum = np.abs(np.fft.rfft(oscillation, 16 * len(oscillation)))
-    guess = 2 * np.pi * np.argmax(spectrum) / (16 * len(oscillation)) / (time[1] - time[0])
-    best = min(
-        (curve_fit(model, time, z, (z[-1], np.ptp(z) / 2, d, guess, 0.0), maxfev=20000)[0] for d in (1.0, 5.0, 15.0)),
-        key=lambda fitted: ((model(time, *fitted) - z) ** 2).sum(),
-    )
-    _, _, decay, w, _ = best
-    return abs(w) / (2 * np.pi), decay / np.hypot(decay, w)
+def identify(dataset: Dataset, method: str, run: Path) -> FittedModel:
+    """The material that fits the motion of all recordings in the plane of the swing best."""
+    run.mkdir(parents=True, exist_ok=True)
+    settings = Settings(method, (dataset.name,), EPOCHS, 0.0, 0.0, 0, IDENTIFICATION_FRAMES, 0, by_sigma=True)
+    return identify_material([dataset], settings, run, lambda row: None)
 
 
-def compare_with_recordings(dataset: Dataset, material: Material) -> list[dict[str, float | str]]:
-    """Frequency, damping ratio, static deflection and marker error of every recording."""
-    simulator = replace(dataset.simulator, material=material)
-    names = list(dataset.trajectories)
-    recordings = Recordings.of(replace(dataset, simulator=simulator), names)
+def compare(dataset: Dataset, model: FittedModel, recordings: list[BeamRecording]) -> pd.DataFrame:
+    """Frequency, damping ratio, static drop and marker error of every recording."""
+    parameters, markers = model.parameters(dataset.simulator), dataset.markers
+    batch = Recordings.of(dataset, [item.name for item in recordings])
     with torch.no_grad():
-        markers, _ = recordings.simulate()
-        at_rest = equilibrium(simulator, dataset.start(names).force)
-        static_height = dataset.markers.positions(at_rest)[..., 2].mean(-1).numpy()
-    straight_height = dataset.markers.rest[:, 2].mean()
-    errors = frame_errors(recordings, markers)
+        simulated, _ = batch.simulate(parameters=parameters)
+        at_rest = markers.positions(equilibrium(dataset.simulator, dataset.start(batch.names).force, parameters))
+    straight = markers.rest[:, 2].mean()
     rows = []
-    for b, name in enumerate(names):
-        item = dataset.trajectories[name]
-        frames = len(item.time)
-        time, recorded = item.time - item.time[0], item.markers[..., 2].mean(-1)
-        # The first five frames contain higher modes.
-        frequency, damping = frequency_and_damping(time[5:], markers[5:frames, b, :, 2].mean(-1).numpy())
-        recorded_frequency, recorded_damping = frequency_and_damping(time[5:], recorded[5:])
+    for b, item in enumerate(recordings):
+        trajectory = dataset.trajectories[item.name]
+        own = simulated[: len(trajectory.time), b].numpy()
+        measured, found = (
+            fit_oscillation(trajectory.time, motion[..., 2].mean(1)) for motion in (trajectory.markers, own)
+        )
         rows.append(
             {
-                "recording": name,
-                "recorded Hz": recorded_frequency,
-                "Hz": frequency,
-                "recorded damping": recorded_damping,
-                "damping": damping,
-                "recorded drop mm": 1e3 * (straight_height - recorded[-40:].mean()),
-                "drop mm": 1e3 * (straight_height - static_height[b]),
-                "error mm": 1e3 * errors[b].mean(),
+                "recording": item.name,
+                "recorded Hz": measured.frequency,
+                "Hz": found.frequency,
+                "recorded damping": measured.damping,
+                "damping": found.damping,
+                "recorded drop mm": 1e3 * (straight - item.settled_height),
+                "drop mm": 1e3 * (straight - at_rest[b, :, 2].mean().item()),
+                "error mm": 1e3 * np.linalg.norm((own - trajectory.markers)[..., ::2], axis=-1).mean(),
             }
         )
-    return rows
+    return pd.DataFrame(rows)
 
 
-def identify(dataset: Dataset, run: Path) -> Material:
-    """The material whose E, nu and viscosity fit all recordings best."""
-    items = {name: replace(item, split="train") for name, item in dataset.trajectories.items()}
-    settings = Settings("sysid-damping", (dataset.name,), 25, 1e-3, 0.0, 25, IDENTIFICATION_FRAMES, 0)
-    model = identify_material([replace(dataset, trajectories=items)], settings, run, lambda row: None)
-    values: dict[str, Any] = dict(model.material or {})
-    return replace(dataset.simulator.material, **values)
+def agreement(table: pd.DataFrame) -> pd.Series:
+    """Largest differences between simulations and recordings, and the mean marker error."""
+    return pd.Series(
+        {
+            "frequency, within %": 100 * (table["Hz"] / table["recorded Hz"] - 1).abs().max(),
+            "damping, within": (table["damping"] - table["recorded damping"]).abs().max(),
+            "drop, within mm": (table["drop mm"] - table["recorded drop mm"]).abs().max(),
+            "error mm": table["error mm"].mean(),
+        }
+    )
+
+
+class Bench:
+    """The recordings and the folder of the results."""
+
+    def __init__(self, folder: Path, out: Path) -> None:
+        self.folder, self.out = folder, out
+        self.text: dict[str, Any] = yaml.safe_load((SPECIMENS / "clamped_beam.yaml").read_text())
+
+    def specimen(self, entries: dict[str, str], path: Path) -> tuple[Specimen, list[BeamRecording]]:
+        """The specimen with some entries of its material replaced, written to a file, and the recordings."""
+        content = self.text | {"material": self.text["material"] | entries}
+        write_text(path, yaml.safe_dump(content, sort_keys=False))
+        return read_beam(read_specimen(path), self.folder, SPECIMENS / "clamped_beam_recordings.csv")
+
+    def history(self, specimen: Specimen, recordings: list[BeamRecording]) -> dict[str, np.ndarray]:
+        """Node positions before the recordings; those of the first law serve all laws, which hardly differ in them."""
+        path = self.out / "history.npz"
+        if not path.exists():
+            found = fit_history(moving_dataset(specimen, recordings, {}), specimen, recordings)
+            np.savez(path, **found)  # type: ignore[arg-type]
+        with np.load(path) as content:
+            return {name: content[name] for name in content}
+
+    def run(self, name: str, entries: dict[str, str], method: str) -> pd.DataFrame:
+        """The table of one configuration, computed or read."""
+        run = self.out / name.replace(", ", "-") / method
+        path = run / "table.csv"
+        if not path.exists():
+            begin = time.perf_counter()
+            run.mkdir(parents=True, exist_ok=True)
+            specimen, recordings = self.specimen(entries, run / "specimen.yaml")
+            history = self.history(specimen, recordings) if method in HISTORY_METHODS else {}
+            dataset = moving_dataset(specimen, recordings, history)
+            model = FittedModel("original") if method == ASSUMED else identify(dataset, method, run)
+            table = compare(dataset, model, recordings)
+            table.insert(0, "method", method)
+            table.insert(0, "configuration", name)
+            table.to_csv(path, index=False)
+            print(f"({name}, {method}: {time.perf_counter() - begin:.0f} s)", flush=True)
+        parameters = run / "parameters.csv"
+        if parameters.exists():
+            print(f"{name}, {method}:", *parameter_sentences(pd.read_csv(parameters)), sep="\n  ")
+        return pd.read_csv(path)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", type=Path, help="folder of the beam's recordings")
     parser.add_argument("--out", type=Path, required=True, help="folder for runs and results")
+    parser.add_argument("--only", help="compute and print only configurations whose name starts like this")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
-    described = read_specimen(SPECIMENS / "clamped_beam.yaml")
-    rows = read_recording_rows(SPECIMENS / "clamped_beam_recordings.csv")
-    settings = CaptureSettings(8e-3, 3e-3, 100.0, REST, True)
-    tables = []
-    for number, (name, integrator, substeps, values) in enumerate(CONFIGURATIONS):
-        path = options.out / f"{number}.csv"
-        if not path.exists():
-            assumed = Material(described.material.youngs_modulus, described.material.poissons_ratio, **values)
-            specimen = replace(described, material=assumed, integrator=integrator, substeps=substeps)
-            dataset = build_dataset(specimen, options.recordings, rows, settings, "", lambda: None)
-            identified = identify(dataset, options.out / str(number))
-            results = []
-            for stage, material in (("assumed", assumed), ("identified", identified)):
-                parameters = (
-                    f"{1e-3 * material.youngs_modulus:.1f} kPa, {material.poissons_ratio:.4f}, {material.viscosity:.1f}"
-                )
-                labels = {
-                    "preset": name,
-                    "integrator": f"{integrator} x{substeps}",
-                    "stage": stage,
-                    "E, nu, Pa s": parameters,
-                }
-                results += [labels | row for row in compare_with_recordings(dataset, material)]
-            pd.DataFrame(results).to_csv(path, index=False)
-        tables.append(pd.read_csv(path))
-        print(tables[-1].round(3).to_string(), flush=True)
+    bench = Bench(options.recordings, options.out)
+    tables = [
+        bench.run(name, entries, method)
+        for name, entries, methods in CONFIGURATIONS
+        for method in methods
+        if name.startswith(options.only or "")
+    ]
     table = pd.concat(tables)
-    table.to_csv(options.out / "presets.csv", index=False)
-    keys = ["preset", "integrator", "stage", "E, nu, Pa s"]
-    print("mean marker error [mm]")
-    print(table.groupby(keys, sort=False)["error mm"].mean().round(3).to_string())
+    print(table.round(3).to_string(index=False))
+    print("how far one material explains all recordings")
+    keys = ["configuration", "method"]
+    print(table.groupby(keys, sort=False).apply(agreement, include_groups=False).round(3).to_string())
 
 
 if __name__ == "__main__":
