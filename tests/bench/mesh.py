@@ -10,7 +10,7 @@ Two independent references stand for the exact solution:
 - the simulator, with cells divided once and twice and extrapolated.
 
 Resumable: values under --out are not computed again. Delete those of a scheme whose elements have changed. All
-together take about an hour and 4 GB, most of both for the fine fish-tail.
+together take about an hour and 2 GB, most of both for the fine fish-tail.
 """
 
 import argparse
