@@ -30,6 +30,8 @@ class Start:
         force: constant nodal forces, without gravity [N], (B, N, 3).
         added_mass: attached mass that moves with the nodes [kg], (B, N); `force` must include its weight.
         names: of the trajectories, for messages, (B).
+        history: positions in the frames before q, oldest first [m], (H, B, N, 3), for the memory of viscous
+            materials. The bodies were long at rest at the oldest; without history, at q.
     """
 
     q: Tensor
@@ -37,6 +39,7 @@ class Start:
     force: Tensor
     added_mass: Tensor
     names: tuple[str, ...]
+    history: Tensor | None = None
 
     @classmethod
     def at_rest(cls, q: Tensor, force: Tensor | None = None, names: tuple[str, ...] | None = None) -> "Start":
@@ -67,14 +70,18 @@ class _BodyBatch:
         hourglass = simulator.hourglass_stiffness(values, batch)
         return cls(simulator, values, moduli, hourglass, own_mass + added_mass, weight)
 
-    def initial_memory(self, state: State) -> ViscousMemory | None:
-        """Memory of bodies that have long been at rest at their positions, or None without viscosity."""
+    def initial_memory(self, start: Start) -> ViscousMemory | None:
+        """Memory of the history of bodies, or None without viscosity."""
         if not self.parameters.viscous:
             return None
-        batch = len(state.q)
+        batch = len(start.q)
         branches = self.parameters.branches(self.simulator.material.law, batch)
         viscosity = self.parameters.viscosity.expand(batch)
-        return ViscousMemory(viscosity, *branches, strains(state.q, self.simulator.engine))
+        path = [start.q] if start.history is None else [*start.history, start.q]
+        memory = ViscousMemory(viscosity, *branches, strains(path[0], self.simulator.engine))
+        for q in path[1:]:
+            memory = memory.after(strains(q, self.simulator.engine), self.simulator.time_step)
+        return memory
 
     def solve(
         self,
@@ -156,7 +163,7 @@ def simulate_steps(
     factors = simulator.engine.allocate(len(start.q))
     fixed = torch.from_numpy(simulator.fixed)
     state = State(start.q, start.v, torch.zeros_like(start.q))
-    memory = body.initial_memory(state)
+    memory = body.initial_memory(start)
     duration = integrator.fraction * h  # from the latest solution to the next
     begin = start.q[:, fixed]
     for step in range(steps):

@@ -200,3 +200,18 @@ def test_equilibria_are_relaxed() -> None:
     with torch.no_grad():
         q, _ = rollout(simulator, replace(start, force=force), 40)
     assert float((q - start.q).abs().max()) < 1e-9
+
+
+def test_a_motion_continues_from_its_history() -> None:
+    """From the state in the middle and the positions before it, implicit Euler repeats the rest of the motion."""
+    simulator, start = bent_beam("implicit-euler", 5e-3, branch_shares=SHARES, branch_times=TIMES, viscosity=50.0)
+    middle = 12
+    with torch.no_grad():
+        q, _ = rollout(simulator, start, 2 * middle)
+        velocity = (q[middle] - q[middle - 1]) / simulator.time_step
+        resumed = replace(start, q=q[middle], v=velocity, history=q[:middle])
+        again, _ = rollout(simulator, resumed, middle)
+        forgetful, _ = rollout(simulator, replace(resumed, history=None), middle)
+    amplitude = float((q[-1] - start.q).abs().max())
+    assert float((again - q[middle:]).abs().max()) < 1e-8 * amplitude
+    assert float((forgetful - q[middle:]).abs().max()) > 1e-2 * amplitude
