@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 Array = NDArray[Any]
 
 # Columns of `moduli`. Internal forces are linear in each.
-MODULI = ("mu", "lambda", "viscous modulus", "stiffness damping times rest mu", "stiffness damping times rest lambda")
-VISCOUS, DAMPING = 2, (3, 4)  # columns
+MODULI = ("mu", "lambda", "stiffness damping times rest mu", "stiffness damping times rest lambda")
+DAMPING = (2, 3)  # columns
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,8 @@ class ConstitutiveState:
     viscous modulus; see `rafl.simulation.viscous_memory`.
 
     Attributes:
-        moduli: mu, lambda, viscous modulus g [Pa]; stiffness damping times rest mu and lambda [Pa s]; (B, 5).
+        moduli: mu, lambda [Pa]; stiffness damping times rest mu and lambda [Pa s]; (B, 4).
+        viscous_modulus: g at every integration point [Pa], (B, E, P), or None without viscosity.
         memory: of the viscous stress at every integration point [Pa], components 00 11 22 01 12 02, (B, E, P, 6), or
             None without viscosity.
         velocity_offset, velocity_factor: nodal velocities are velocity_factor * q - velocity_offset, (B, N, 3) [m/s]
@@ -48,14 +49,17 @@ class ConstitutiveState:
         hourglass: for `enhanced` integration, else None.
         hourglass_memory: of the viscous forces of the hourglass modes, for `enhanced` integration with viscosity
             [Pa m], (B, E, 12), else None.
+        energy_weights: of the learned energy [Pa], (B, K), see `rafl.fem.learned_energy`; None without it.
     """
 
     moduli: Array
+    viscous_modulus: Array | None = None
     memory: Array | None = None
     velocity_offset: Array | None = None
     velocity_factor: float = 1.0
     hourglass: HourglassStiffness | None = None
     hourglass_memory: Array | None = None
+    energy_weights: Array | None = None
 
     def select(self, index: NDArray[np.int64]) -> "ConstitutiveState":
         """The state of the bodies `index` of the batch."""
@@ -65,9 +69,11 @@ class ConstitutiveState:
 
         return ConstitutiveState(
             self.moduli[index],
+            chosen(self.viscous_modulus),
             chosen(self.memory),
             chosen(self.velocity_offset),
             self.velocity_factor,
             None if self.hourglass is None else self.hourglass.select(index),
             chosen(self.hourglass_memory),
+            chosen(self.energy_weights),
         )

@@ -30,6 +30,7 @@ from rafl.fem.kernel_layout import (
     V,
 )
 from rafl.fem.laws.kernel import fill_derivatives
+from rafl.fem.learned_energy import add_learned_energy
 from rafl.fem.simd import KERNEL_OPTIONS, lane_products, transposed_product, weighted_rows
 from rafl.fem.svd import signed_svd_simd
 
@@ -139,12 +140,14 @@ def fill_tangent(w):
 def add_viscous_stress(w, viscous_modulus, memory, project, tangent):
     """Add the viscous stress F S, S = 2 (g E - memory), with g the viscous modulus, to STRESS, ENERGY and TANGENT.
 
-    memory (8, 6) [Pa].
+    viscous_modulus (8) and memory (8, 6) [Pa]; points without viscosity have a modulus of zero.
     """
-    g_modulus = viscous_modulus
     F = np.empty((3, 3))
     S = np.empty((3, 3))
     for g in range(8):
+        g_modulus = viscous_modulus[g]
+        if not g_modulus > 0.0:
+            continue
         weight = w[WEIGHT * 8 + g]
         for i in range(3):
             for j in range(3):
@@ -216,7 +219,11 @@ def _add_cell(
     mu,
     lam,
     moduli,
+    learned,
+    energy_weights,
+    learned_share,
     viscous,
+    viscous_modulus,
     memory,
     damped,
     velocity_gradient,
@@ -235,18 +242,20 @@ def _add_cell(
             component_gradient(w, (DEFORMATION + 3 * i + j) * 8, x, i, gradients_by_point, 8 * j)
     signed_svd_simd(w)
     fill_derivatives(law, w, mu, lam)
+    if learned and learned_share > 0.0:
+        add_learned_energy(w, energy_weights, learned_share)
     fill_stress(w)
     if tangent:
         if project:
             project_semidefinite(w)
         fill_tangent(w)
-    if viscous and moduli[2] > 0.0:
-        add_viscous_stress(w, moduli[2], memory, project, tangent)
+    if viscous:
+        add_viscous_stress(w, viscous_modulus, memory, project, tangent)
     if damped:
         for i in range(3):
             for j in range(3):
                 component_gradient(velocity_gradient, (3 * i + j) * 8, x, 24 + i, gradients_by_point, 8 * j)
-        add_damping_stress(w, moduli[3], moduli[4], velocity_gradient.reshape(9, 8), velocity_factor, tangent)
+        add_damping_stress(w, moduli[2], moduli[3], velocity_gradient.reshape(9, 8), velocity_factor, tangent)
     energy = 0.0
     for g in range(8):
         energy += w[WEIGHT * 8 + g] * w[ENERGY * 8 + g]
@@ -281,7 +290,10 @@ def element_terms(
     group_shares,
     law,
     moduli,
+    learned,
+    energy_weights,
     viscous,
+    viscous_modulus,
     memory,
     damped,
     velocity_offset,
@@ -302,8 +314,11 @@ def element_terms(
         volume: of each point [m^3], (E, G, 8).
         group_shares: fraction of mu and of lambda that each group of points integrates, (G, 2).
         law: address of the elastic law's compiled derivatives, `rafl.fem.laws.law.Law.kernel.address`.
-        moduli: see `rafl.fem.constitutive_state.MODULI`, (B, 5).
-        viscous: whether viscous stress acts, with `memory`.
+        moduli: see `rafl.fem.constitutive_state.MODULI`, (B, 4).
+        learned: whether there is a learned energy.
+        energy_weights: its weights [Pa], (B, K).
+        viscous: whether viscous stress acts, with the next two arguments.
+        viscous_modulus: of each point [Pa], (B, E, 8 G).
         memory: of the viscous stress [Pa], (B, E, 8 G, 6).
         damped: whether stiffness damping acts, with the next two arguments.
         velocity_offset: velocities are velocity_factor * q - velocity_offset, (B, N, 3) [m/s].
@@ -322,6 +337,7 @@ def element_terms(
         w = np.empty(ROWS * 8)
         x = np.zeros(48)
         velocity_gradient = np.zeros(72)
+        point_modulus = np.zeros(8)
         total = 0.0
         for e in range(chunk * CELLS_PER_CHUNK, min(cells, (chunk + 1) * CELLS_PER_CHUNK)):
             for n in range(8):
@@ -339,7 +355,10 @@ def element_terms(
                 for g in range(8):
                     w[WEIGHT * 8 + g] = volume[e, group, g]
                 group_moduli = moduli[t] * group_shares[group, 0]
-                group_moduli[4] = moduli[t, 4] * group_shares[group, 1]
+                group_moduli[3] = moduli[t, 3] * group_shares[group, 1]
+                if viscous:
+                    for g in range(8):
+                        point_modulus[g] = group_shares[group, 0] * viscous_modulus[t, e, 8 * group + g]
                 cell_memory = memory[t, e, 8 * group : 8 * group + 8] if viscous else memory[0, 0]
                 total += _add_cell(
                     w,
@@ -350,7 +369,11 @@ def element_terms(
                     group_moduli[0],
                     moduli[t, 1] * group_shares[group, 1],
                     group_moduli,
+                    learned,
+                    energy_weights[t if learned else 0],
+                    group_shares[group, 0],
                     viscous,
+                    point_modulus,
                     cell_memory,
                     damped,
                     velocity_gradient,

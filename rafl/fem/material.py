@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.fem.laws import LAWS
+from rafl.fem.learned_energy import UNITS as ENERGY_UNITS
+from rafl.fem.learned_viscosity import UNITS as VISCOSITY_UNITS
 from rafl.fem.mesh import HexMesh
 
 MASS_MODELS = ("lumped", "uniform")
@@ -56,6 +58,9 @@ class Material:
         viscosity: Kelvin-Voigt coefficient eta [Pa s]; second Piola-Kirchhoff stress 2 eta dE/dt.
         branch_shares, branch_times: of the Maxwell branches: shear modulus relative to mu at rest, and relaxation time
             [s]; see `rafl.simulation.viscous_memory`. E is the relaxed modulus.
+        energy_weights: of a learned strain energy, see `rafl.fem.learned_energy`, relative to the law's mu / 2. E and
+            nu stay those of small strains: the law takes what the learned energy leaves of mu. Empty for none.
+        dissipation_weights: of a learned viscosity, see `rafl.fem.learned_viscosity`, relative to mu. Empty for none.
 
     Raises:
         ValueError: unknown name, or a value outside its physical range.
@@ -72,6 +77,8 @@ class Material:
     viscosity: float = 0.0
     branch_shares: tuple[float, ...] = ()
     branch_times: tuple[float, ...] = ()
+    energy_weights: tuple[float, ...] = ()
+    dissipation_weights: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for key, known in (("mass", MASS_MODELS), ("law", tuple(LAWS)), ("integration", INTEGRATION_SCHEMES)):
@@ -99,6 +106,10 @@ class Material:
                 "expected branch_shares of at least 0 and branch_times above 0, "
                 f"got {self.branch_shares} and {self.branch_times}"
             )
+        for key, units in (("energy_weights", ENERGY_UNITS), ("dissipation_weights", VISCOSITY_UNITS)):
+            weights = getattr(self, key)
+            if len(weights) not in (0, units) or not min(weights, default=0.0) >= 0:
+                raise ValueError(f"expected {units} {key} of at least 0, or none, got {weights}")
 
     @property
     def lame(self) -> tuple[float, float]:

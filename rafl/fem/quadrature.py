@@ -50,7 +50,7 @@ class QuadratureRule:
         return np.repeat(self.group_shares, len(self.points.shape) // len(self.group_shares), axis=0)
 
     def max_rest_stiffness(self, moduli: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Upper bound [N/m] of the diagonal of the cells' tangents at rest, (B), for moduli (B, 5)."""
+        """Upper bound [N/m] of the diagonal of the cells' tangents at rest, (B), for moduli (B, 4)."""
         return (2.0 * moduli[:, 0] + moduli[:, 1]) * self._stiffness_per_modulus
 
     @cached_property

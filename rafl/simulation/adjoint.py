@@ -9,8 +9,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rafl.fem.constitutive_state import DAMPING, VISCOUS, ConstitutiveState, HourglassStiffness
+from rafl.fem.constitutive_state import DAMPING, ConstitutiveState, HourglassStiffness
 from rafl.fem.enhanced.hourglass import MODES
+from rafl.fem.learned_energy import force_derivatives
 from rafl.fem.strain import MULTIPLICITY, scatter
 from rafl.simulation.engine import Engine
 from rafl.simulation.simulator import Simulator
@@ -42,9 +43,9 @@ class ImplicitSolve(torch.autograd.Function):
     """Positions x (B, N, 3) with inertia (x - target) + internal force(x) = force on the free nodes.
 
     Inputs: target (B, N, 3) [m], inertia (B, N) [kg/s^2], force (B, N, 3) [N], positions of the fixed nodes (B, F, 3)
-    [m], moduli (B, 5), the stiffness of the hourglass modes (3, B, U, 12, 12) for `enhanced` integration, the memory of
-    the viscous stress (B, E, Z) and the velocity offset (B, N, 3) of stiffness damping; each of the last three may be
-    None.
+    [m], moduli (B, 4), the weights of the learned energy (B, K) [Pa], the stiffness of the hourglass modes (3, B, U, 12,
+    12) for `enhanced` integration, the modulus (B, E, P) [Pa] and the memory (B, E, Z) of the viscous stress, and the
+    velocity offset (B, N, 3) of stiffness damping; each after the moduli may be None.
 
     At the solution (inertia + K) dx = inertia dtarget + dforce - ..., with K the exact tangent. So one adjoint solve
     gives all derivatives.
@@ -58,14 +59,17 @@ class ImplicitSolve(torch.autograd.Function):
         force: Tensor,
         fixed_positions: Tensor,
         moduli: Tensor,
+        energy: Tensor | None,
         hourglass: Tensor | None,
+        viscous_modulus: Tensor | None,
         memory: Tensor | None,
         velocity_offset: Tensor | None,
         context: SolveContext,
     ) -> Tensor:
         """Solve for x."""
         simulator = context.simulator
-        state = _constitutive_state(moduli, hourglass, memory, velocity_offset, context)
+        history = (energy, hourglass, viscous_modulus, memory, velocity_offset)
+        state = _constitutive_state(moduli, *history, context)
         arrays = [_array(tensor) for tensor in (target, inertia, force, fixed_positions)]
         if context.guess is None:
             start = np.broadcast_to(simulator.mesh.vertices, arrays[2].shape).copy()
@@ -77,15 +81,15 @@ class ImplicitSolve(torch.autograd.Function):
             x = simulator.minimise(start, arrays[1], arrays[0], arrays[2], state, context.label, context.factors)
         result = torch.from_numpy(x)
         ctx.context = context
-        ctx.save_for_backward(result, target, inertia, moduli, hourglass, memory, velocity_offset)
+        ctx.save_for_backward(result, target, inertia, moduli, *history)
         return result
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Derivatives with respect to each input."""
-        x, target, inertia, moduli, hourglass, memory, velocity_offset = ctx.saved_tensors
+        x, target, inertia, moduli, *history = ctx.saved_tensors
         simulator, engine = ctx.context.simulator, ctx.context.simulator.engine
-        state = _constitutive_state(moduli, hourglass, memory, velocity_offset, ctx.context)
+        state = _constitutive_state(moduli, *history, ctx.context)
         q = _array(x)
         batch, nodes = q.shape[:2]
         free = engine.free_index
@@ -94,7 +98,7 @@ class ImplicitSolve(torch.autograd.Function):
         right = np.ascontiguousarray(_array(grad).reshape(batch, -1)[:, free])
         adjoint = np.zeros((batch, 3 * nodes))
         needs = ctx.needs_input_grad
-        by_fixed = by_moduli = by_hourglass = by_memory = by_velocity_offset = None
+        by_fixed = by_moduli = by_energy = by_hourglass = by_viscous_modulus = by_memory = by_velocity_offset = None
         with engine.thread_limit(batch):
             tangents = engine.evaluate(q, state, tangent=True)[2]
             adjoint[:, free] = engine.solve_once(tangents, diagonal, right[:, None])[:, 0]
@@ -103,17 +107,20 @@ class ImplicitSolve(torch.autograd.Function):
                 by_fixed = torch.from_numpy(grad.numpy()[:, simulator.fixed] - engine.reactions(tangents, adjoint))
             if needs[4]:
                 by_moduli = torch.from_numpy(_by_moduli(engine, q, state, adjoint))
-            if needs[5] or needs[6] or (needs[4] and memory is not None):
+            if needs[5]:
+                shares = engine.quadrature.point_shares[:, 0]
+                slopes = force_derivatives(engine.mesh, engine.quadrature.points, shares, q, adjoint)
+                by_energy = -torch.from_numpy(slopes)
+            if any(needs[6:9]):
                 strain, change = engine.strains(q, adjoint)
-                if needs[5]:
+                if needs[6]:
                     by_hourglass = torch.from_numpy(_by_hourglass(engine, q, state, adjoint, strain, change))
-                if memory is not None:
+                if needs[7] or needs[8]:
                     dual = _dual_of_viscous_strain(engine, state, change)
                     by_memory = torch.from_numpy(dual)
-                    if by_moduli is not None:
-                        by_moduli[:, VISCOUS] = -torch.from_numpy((dual * strain).sum(axis=(1, 2)))
+                    by_viscous_modulus = -torch.from_numpy(_over_points(dual * strain, state))
         by_force = torch.from_numpy(adjoint)
-        if needs[7]:
+        if needs[9]:
             by_velocity_offset = torch.from_numpy(_by_velocity_offset(engine, state, adjoint))
         return (
             inertia[..., None] * by_force if needs[0] else None,
@@ -121,7 +128,9 @@ class ImplicitSolve(torch.autograd.Function):
             by_force,
             by_fixed,
             by_moduli,
+            by_energy,
             by_hourglass,
+            by_viscous_modulus,
             by_memory,
             by_velocity_offset,
             None,
@@ -157,7 +166,9 @@ def _array(tensor: Tensor) -> Array:
 
 def _constitutive_state(
     moduli: Tensor,
+    energy: Tensor | None,
     hourglass: Tensor | None,
+    viscous_modulus: Tensor | None,
     memory: Tensor | None,
     velocity_offset: Tensor | None,
     context: SolveContext,
@@ -170,16 +181,18 @@ def _constitutive_state(
         memories = [own, np.ascontiguousarray(whole[..., 6 * points :])]
     return ConstitutiveState(
         _array(moduli),
+        None if viscous_modulus is None else _array(viscous_modulus),
         memories[0],
         None if velocity_offset is None else _array(velocity_offset),
         context.velocity_factor,
         None if hourglass is None else HourglassStiffness(*_array(hourglass)),
         memories[1] if hourglass is not None else None,
+        None if energy is None else _array(energy),
     )
 
 
 def _by_moduli(engine: Engine, q: Array, state: ConstitutiveState, adjoint: Array) -> Array:
-    """Minus adjoint . d(internal force) / d(moduli), (B, 5), except the viscous modulus.
+    """Minus adjoint . d(internal force) / d(moduli), (B, 4).
 
     The internal force at the integration points is linear in each modulus.
     """
@@ -192,9 +205,21 @@ def _by_moduli(engine: Engine, q: Array, state: ConstitutiveState, adjoint: Arra
         unit = np.zeros_like(state.moduli)
         unit[:, k] = 1.0
         single = ConstitutiveState(
-            unit, None, state.velocity_offset if k in DAMPING else None, state.velocity_factor, hourglass
+            unit,
+            velocity_offset=state.velocity_offset if k in DAMPING else None,
+            velocity_factor=state.velocity_factor,
+            hourglass=hourglass,
         )
         out[:, k] = -(adjoint * engine.evaluate(q, single, tangent=False)[1]).sum(axis=(1, 2))
+    return out
+
+
+def _over_points(values: Array, state: ConstitutiveState) -> Array:
+    """Sums of values per strain (B, E, Z) over the strains that share a viscous modulus, (B, E, P)."""
+    assert state.viscous_modulus is not None
+    batch, cells, points = state.viscous_modulus.shape
+    out: Array = values[..., : 6 * points].reshape(batch, cells, points, 6).sum(-1)
+    out[..., 0] += values[..., 6 * points :].sum(-1)
     return out
 
 
@@ -228,7 +253,8 @@ def _by_hourglass(
         np.zeros_like(state.hourglass.elastic),
     ]
     if state.hourglass_memory is not None:
-        viscous_strain = state.moduli[:, VISCOUS, None, None] * own - state.hourglass_memory
+        assert state.viscous_modulus is not None
+        viscous_strain = state.viscous_modulus * own - state.hourglass_memory
         parts[1] = _by_shape(engine, along, viscous_strain)
     if state.velocity_offset is not None:
         velocity = state.velocity_factor * q - state.velocity_offset

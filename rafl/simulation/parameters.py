@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from rafl.fem.laws import LAWS
+from rafl.fem.learned_energy import rest_share
 from rafl.fem.material import Material, lame
 
 
@@ -14,7 +15,7 @@ from rafl.fem.material import Material, lame
 class Parameters:
     """Material and gravity as tensors: scalars, or one number per trajectory (B); gravity (3) or (B, 3).
 
-    Shares and times of K branches are (K) or (B, K).
+    Shares and times of K branches are (K) or (B, K), and so are the weights of a learned energy and viscosity.
 
     Units are those of `rafl.fem.material.Material`; gravity in m/s^2.
     """
@@ -27,6 +28,8 @@ class Parameters:
     viscosity: Tensor
     branch_shares: Tensor
     branch_times: Tensor
+    energy_weights: Tensor
+    dissipation_weights: Tensor
     gravity: Tensor
 
     @classmethod
@@ -37,8 +40,9 @@ class Parameters:
 
     @property
     def viscous(self) -> bool:
-        """Whether there are branches, or viscosity is non-zero or requires a gradient."""
-        return self.branch_times.shape[-1] > 0 or _acts(self.viscosity)
+        """Whether there are branches or a learned viscosity, or viscosity is non-zero or requires a gradient."""
+        has_units = self.branch_times.shape[-1] > 0 or self.dissipation_weights.shape[-1] > 0
+        return has_units or _acts(self.viscosity)
 
     @property
     def stiffness_damped(self) -> bool:
@@ -50,10 +54,29 @@ class Parameters:
         """Whether viscous stress or stiffness damping acts."""
         return self.viscous or self.stiffness_damped
 
+    def _law_lame(self) -> tuple[Tensor, Tensor]:
+        """Parameters mu and lambda of the law [Pa]: mu without what a learned energy has of it at rest."""
+        mu, lam = lame(self.youngs_modulus, self.poissons_ratio)
+        return (mu / (1.0 + rest_share(self.energy_weights)) if self.energy_weights.shape[-1] else mu), lam
+
     def rest_lame(self, law: str, batch: int) -> tuple[Tensor, Tensor]:
-        """Lame parameters mu and lambda of the law's linearisation at rest [Pa], (B) each."""
-        mu, lam = LAWS[law].rest_lame(*lame(self.youngs_modulus, self.poissons_ratio))
-        return mu.expand(batch), lam.expand(batch)
+        """Lame parameters mu and lambda of the linearisation at rest [Pa], (B) each, learned energy included."""
+        own, lam = self._law_lame()
+        mu, rest_lam = LAWS[law].rest_lame(own, lam)
+        if self.energy_weights.shape[-1]:
+            mu = mu + own * rest_share(self.energy_weights)
+        return mu.expand(batch), rest_lam.expand(batch)
+
+    def energy(self, batch: int) -> Tensor | None:
+        """Weights of the learned energy [Pa], (B, K), or None without it."""
+        units = self.energy_weights.shape[-1]
+        own, _ = self._law_lame()
+        return 0.5 * own[..., None] * self.energy_weights.expand(batch, units) if units else None
+
+    def dissipation(self, law: str, batch: int) -> Tensor | None:
+        """Weights of the learned viscosity times mu at rest [Pa], (B, K), or None without it."""
+        units = self.dissipation_weights.shape[-1]
+        return self.rest_lame(law, batch)[0][:, None] * self.dissipation_weights.expand(batch, units) if units else None
 
     def branches(self, law: str, batch: int) -> tuple[Tensor, Tensor]:
         """Moduli [Pa] and relaxation times [s] of the branches, (B, K) each."""
@@ -62,11 +85,11 @@ class Parameters:
         return mu[:, None] * self.branch_shares.expand(shape), self.branch_times.expand(shape)
 
     def moduli(self, law: str, batch: int) -> Tensor:
-        """Columns of `rafl.fem.constitutive_state.MODULI`, (B, 5), without a viscous modulus."""
-        mu, lam = lame(self.youngs_modulus, self.poissons_ratio)
+        """Columns of `rafl.fem.constitutive_state.MODULI`, (B, 4)."""
+        mu, lam = self._law_lame()
         rest_mu, rest_lam = self.rest_lame(law, batch)
         beta = self.stiffness_damping
-        columns = (mu, lam, torch.zeros_like(mu), beta * rest_mu, beta * rest_lam)
+        columns = (mu, lam, beta * rest_mu, beta * rest_lam)
         return torch.stack([column.expand(batch) for column in columns], dim=-1)
 
 

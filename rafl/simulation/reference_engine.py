@@ -11,9 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rafl.fem.constitutive_state import ConstitutiveState
+from rafl.fem.constitutive_state import DAMPING, ConstitutiveState
 from rafl.fem.enhanced.hourglass import MODES, HourglassModes
 from rafl.fem.laws import LAWS
+from rafl.fem.learned_energy import reference_learned_energy
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule
 from rafl.fem.strain import green_strain, green_strain_adjoint, scatter
@@ -80,9 +81,12 @@ class ReferenceEngine:
         energy, first, second, flip = LAWS[self.law].reference_derivatives(
             s, mu.expand(s.shape[:-1]), lam.expand(s.shape[:-1])
         )
+        if state.energy_weights is not None:
+            learned = reference_learned_energy(s, self._tensor(state.energy_weights), self._shares[:, 0])
+            energy, first, second, flip = (a + b for a, b in zip((energy, first, second, flip), learned, strict=True))
         P = U @ torch.diag_embed(first) @ V.mT
         H = self._tangent(U, s, V, first, second, flip, project) if tangent else None
-        for term in (self._viscous_stress(F, moduli, state, tangent, project), self._damping_stress(q, moduli, state)):
+        for term in (self._viscous_stress(F, state, tangent, project), self._damping_stress(q, moduli, state)):
             if term is not None:
                 energy, P = energy + term[0], P + term[1]
                 H = None if H is None else H + term[2]
@@ -119,7 +123,8 @@ class ReferenceEngine:
         )
         modulus, memory = elastic.new_zeros(shape), elastic.new_zeros(*shape, MODES)
         if state.hourglass_memory is not None:
-            modulus = self._tensor(state.moduli[:, 2, None]).expand(shape)
+            assert state.viscous_modulus is not None
+            modulus = self._tensor(state.viscous_modulus[..., 0])
             memory = self._tensor(state.hourglass_memory)
         cells = self._cell_arguments(q, rotation)
         arguments = (*cells, elastic, viscous, modulus, memory)
@@ -195,13 +200,14 @@ class ReferenceEngine:
         return torch.einsum("...ia,...jb,...abcd,...kc,...ld->...ijkl", U, V, local, U, V)
 
     def _viscous_stress(
-        self, F: Tensor, moduli: Tensor, state: ConstitutiveState, tangent: bool, project: bool
+        self, F: Tensor, state: ConstitutiveState, tangent: bool, project: bool
     ) -> tuple[Tensor, Tensor, Tensor] | None:
         """Energy, stress P = F 2 (g E - memory) and tangent dP / dF, or None without viscosity."""
         if state.memory is None:
             return None
+        assert state.viscous_modulus is not None
         shares = self._shares[:, 0, None, None]
-        g = moduli[:, 2, None, None, None, None]
+        g = self._tensor(state.viscous_modulus)[..., None, None]
         identity = torch.eye(3, dtype=torch.float64, device=self.device)
         memory = F.new_zeros(F.shape)
         components = self._tensor(state.memory)
@@ -226,7 +232,7 @@ class ReferenceEngine:
         """Energy, stress P and tangent dP / dF of stiffness damping, or None without it."""
         if state.velocity_offset is None:
             return None
-        weighted = moduli[:, [3, 4], None, None] * self._shares.T[:, None]
+        weighted = moduli[:, list(DAMPING), None, None] * self._shares.T[:, None]
         mu, lam = (x[..., None, None] for x in weighted.unbind(1))
         identity = torch.eye(3, dtype=torch.float64, device=self.device)
         velocity = state.velocity_factor * self._tensor(q) - self._tensor(state.velocity_offset)

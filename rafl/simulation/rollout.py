@@ -7,7 +7,6 @@ import torch
 from torch import Tensor
 
 from rafl.common.errors import SimulationError
-from rafl.fem.constitutive_state import VISCOUS
 from rafl.simulation.adjoint import SolveContext, implicit_solve, strains
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.simulator import Simulator
@@ -55,7 +54,8 @@ class _BodyBatch:
 
     simulator: Simulator
     parameters: Parameters
-    moduli: Tensor  # (B, 5), without a viscous modulus
+    moduli: Tensor  # (B, 4)
+    energy: Tensor | None  # weights of the learned energy [Pa], (B, K)
     hourglass: Tensor | None  # (3, B, U, 12, 12), for `enhanced` integration
     mass: Tensor  # [kg], (B, N)
     weight: Tensor  # [N], (B, N, 3)
@@ -68,19 +68,22 @@ class _BodyBatch:
         weight = own_mass[..., None] * values.gravity.expand(batch, 3)[:, None]
         moduli = values.moduli(simulator.material.law, batch)
         hourglass = simulator.hourglass_stiffness(values, batch)
-        return cls(simulator, values, moduli, hourglass, own_mass + added_mass, weight)
+        return cls(simulator, values, moduli, values.energy(batch), hourglass, own_mass + added_mass, weight)
 
     def initial_memory(self, start: Start) -> ViscousMemory | None:
         """Memory of the history of bodies, or None without viscosity."""
         if not self.parameters.viscous:
             return None
         batch = len(start.q)
-        branches = self.parameters.branches(self.simulator.material.law, batch)
         viscosity = self.parameters.viscosity.expand(batch)
         path = [start.q] if start.history is None else [*start.history, start.q]
-        memory = ViscousMemory(viscosity, *branches, strains(path[0], self.simulator.engine))
+        law, engine = self.simulator.material.law, self.simulator.engine
+        branches = self.parameters.branches(law, batch)
+        points = len(engine.quadrature.points.shape)
+        dissipation = self.parameters.dissipation(law, batch)
+        memory = ViscousMemory(viscosity, points, *branches, strains(path[0], engine), dissipation=dissipation)
         for q in path[1:]:
-            memory = memory.after(strains(q, self.simulator.engine), self.simulator.time_step)
+            memory = memory.after(strains(q, engine), self.simulator.time_step)
         return memory
 
     def solve(
@@ -94,15 +97,13 @@ class _BodyBatch:
         factors: Factors | None = None,
     ) -> tuple[Tensor, ViscousMemory | None]:
         """Solution of a step's equation, `duration` [s] after the latest one, and the memory after it."""
-        simulator, moduli, terms = self.simulator, self.moduli, None
+        simulator, viscous_terms = self.simulator, (None, None)
         if memory is not None:
-            modulus, terms = memory.stress_terms(duration)
-            moduli = torch.cat([moduli[:, :VISCOUS], modulus[:, None], moduli[:, VISCOUS + 1 :]], dim=1)
+            viscous_terms = memory.stress_terms(duration)
         offset = problem.velocity_offset if self.parameters.stiffness_damped else None
         context = SolveContext(simulator, problem.guess, problem.velocity_factor, label, factors)
-        x = implicit_solve(
-            problem.target, problem.inertia, force, fixed_positions, moduli, self.hourglass, terms, offset, context
-        )
+        loads = (problem.target, problem.inertia, force, fixed_positions)
+        x = implicit_solve(*loads, self.moduli, self.energy, self.hourglass, *viscous_terms, offset, context)
         return x, None if memory is None else memory.after(strains(x, simulator.engine), duration)
 
     def initial_acceleration(
@@ -252,7 +253,5 @@ def equilibrium(
         fixed_positions = torch.from_numpy(simulator.mesh.vertices[simulator.fixed]).expand(batch, -1, 3)
     context = SolveContext(simulator, None, label=label)
     no_inertia = force.new_zeros(batch, nodes)
-    target = torch.zeros_like(force)
-    return implicit_solve(
-        target, no_inertia, force + body.weight, fixed_positions, body.moduli, body.hourglass, None, None, context
-    )
+    loads = (torch.zeros_like(force), no_inertia, force + body.weight, fixed_positions)
+    return implicit_solve(*loads, body.moduli, body.energy, body.hourglass, None, None, None, context)

@@ -129,10 +129,12 @@ class Simulator:
     def constitutive_state(self, batch: int) -> ConstitutiveState:
         """Elastic moduli of the material, without damping, for a batch."""
         parameters = self.parameters()
+        energy = parameters.energy(batch)
         hourglass = self.hourglass_stiffness(parameters, batch)
         return ConstitutiveState(
             parameters.moduli(self.material.law, batch).numpy(),
             hourglass=None if hourglass is None else HourglassStiffness(*hourglass.numpy()),
+            energy_weights=None if energy is None else energy.numpy(),
         )
 
     def elastic_gradient(self, q: Array) -> Array:

@@ -99,7 +99,7 @@ def fill_moment(w):
 def add_hourglass_force(w, elastic, viscous, viscous_modulus, memory):
     """Fill the local force and n; add the energy of the hourglass modes to ENERGY, per unit of WEIGHT.
 
-    elastic, viscous (144 * 8): rows of stiffness; memory (12, 8).
+    elastic, viscous (144 * 8): rows of stiffness; viscous_modulus (8), zero without viscosity; memory (12, 8).
     """
     for r in range(12):
         _over_modes(w, (LOCAL_FORCE + r) * 8, w, LOCAL * 8, elastic, 12 * r * 8)
@@ -108,16 +108,18 @@ def add_hourglass_force(w, elastic, viscous, viscous_modulus, memory):
     for r in range(12):
         for g in range(8):
             w[SCRATCH * 8 + g] += 0.5 * w[(LOCAL + r) * 8 + g] * w[(LOCAL_FORCE + r) * 8 + g]
-    if viscous_modulus > 0.0:
-        for g in range(8):
-            for r in range(12):
-                total = 0.0
-                for c in range(12):
-                    strain = viscous_modulus * w[(LOCAL + c) * 8 + g] - memory[c, g]
-                    total += viscous[(12 * r + c) * 8 + g] * strain
-                own = viscous_modulus * w[(LOCAL + r) * 8 + g] - memory[r, g]
-                w[(LOCAL_FORCE + r) * 8 + g] += total
-                w[SCRATCH * 8 + g] += 0.5 / viscous_modulus * own * total
+    for g in range(8):
+        modulus = viscous_modulus[g]
+        if not modulus > 0.0:
+            continue
+        for r in range(12):
+            total = 0.0
+            for c in range(12):
+                strain = modulus * w[(LOCAL + c) * 8 + g] - memory[c, g]
+                total += viscous[(12 * r + c) * 8 + g] * strain
+            own = modulus * w[(LOCAL + r) * 8 + g] - memory[r, g]
+            w[(LOCAL_FORCE + r) * 8 + g] += total
+            w[SCRATCH * 8 + g] += 0.5 / modulus * own * total
     for g in range(8):
         if w[WEIGHT * 8 + g] > 0.0:
             w[ENERGY * 8 + g] += w[SCRATCH * 8 + g] / w[WEIGHT * 8 + g]

@@ -20,6 +20,7 @@ from rafl.fem.enhanced.layout import (
 from rafl.fem.enhanced.tangent import fill_block, fill_tensor
 from rafl.fem.kernel_layout import ENERGY, STRESS, WEIGHT
 from rafl.fem.laws.kernel import fill_derivatives
+from rafl.fem.learned_energy import add_learned_energy
 from rafl.fem.simd import KERNEL_OPTIONS
 from rafl.fem.svd import signed_svd_simd
 
@@ -37,7 +38,10 @@ def enhanced_terms(
     moduli,
     hourglass,
     per_shape,
+    learned,
+    energy_weights,
     viscous,
+    viscous_modulus,
     memory,
     hourglass_memory,
     damped,
@@ -58,10 +62,13 @@ def enhanced_terms(
         columns: mean shape function gradients [1/m] and hourglass vectors of each lane, (G, 7 * 8 nodes * 8 lanes).
         volume: of the lanes' cells [m^3], zero in unused lanes, (G, 8).
         law: address of the elastic law's compiled derivatives, `rafl.fem.laws.law.Law.kernel.address`.
-        moduli: see `rafl.fem.constitutive_state.MODULI`, (B, 5).
+        moduli: see `rafl.fem.constitutive_state.MODULI`, (B, 4).
         hourglass: elastic, viscous and damping stiffness by lane, (B, G or 1, 3, 144 * 8 lanes).
         per_shape: whether `hourglass` has one set for all groups.
-        viscous: whether viscous stress acts, with the next two arguments.
+        learned: whether there is a learned energy.
+        energy_weights: its weights [Pa], (B, K).
+        viscous: whether viscous stress acts, with the next three arguments.
+        viscous_modulus: of each cell [Pa], (B, E, 1).
         memory: of the viscous stress [Pa], (B, E, 1, 6).
         hourglass_memory: [Pa m], (B, E, 12).
         damped: whether stiffness damping acts, with the next two arguments.
@@ -79,6 +86,7 @@ def enhanced_terms(
         t = task // chunks
         chunk = task % chunks
         w = np.zeros(ENHANCED_ROWS * 8)
+        lane_modulus = np.zeros(8)
         lane_memory = np.zeros((8, 6))
         lane_hourglass_memory = np.zeros((12, 8))
         rate = np.zeros((9, 8))
@@ -97,6 +105,7 @@ def enhanced_terms(
                                 velocity_factor * q[t, node, i] - velocity_offset[t, node, i]
                             )
                 if viscous:
+                    lane_modulus[g] = viscous_modulus[t, e, 0]
                     for c in range(6):
                         lane_memory[g, c] = memory[t, e, 0, c]
                     for c in range(12):
@@ -104,14 +113,15 @@ def enhanced_terms(
             fill_kinematics(w, columns[group])
             signed_svd_simd(w)
             fill_derivatives(law, w, moduli[t, 0], moduli[t, 1])
+            if learned:
+                add_learned_energy(w, energy_weights[t], 1.0)
             fill_stress(w)
             if tangent:
                 if project:
                     project_semidefinite(w)
                 fill_tangent(w)
-            viscous_modulus = moduli[t, 2] if viscous else 0.0
-            if viscous_modulus > 0.0:
-                add_viscous_stress(w, viscous_modulus, lane_memory, project, tangent)
+            if viscous:
+                add_viscous_stress(w, lane_modulus, lane_memory, project, tangent)
             if damped:
                 for i in range(3):
                     for j in range(3):
@@ -122,9 +132,9 @@ def enhanced_terms(
                         over_nodes(
                             w, (RATE_VECTORS + 3 * k + i) * 8, w, (VELOCITY + i) * 8, columns[group], 64 * (3 + k)
                         )
-                add_damping_stress(w, moduli[t, 3], moduli[t, 4], rate, velocity_factor, tangent)
+                add_damping_stress(w, moduli[t, 2], moduli[t, 3], rate, velocity_factor, tangent)
             fill_frame(w)
-            add_hourglass_force(w, own[0], own[1], viscous_modulus, lane_hourglass_memory)
+            add_hourglass_force(w, own[0], own[1], lane_modulus, lane_hourglass_memory)
             add_frame_stress(w)
             # Forces of the seven columns: stress, then the hourglass forces in the frame of space.
             for k in range(4):
@@ -164,7 +174,7 @@ def enhanced_terms(
             for g in range(8):
                 total += w[WEIGHT * 8 + g] * w[ENERGY * 8 + g]
             if tangent:
-                fill_tensor(w, own, viscous_modulus, velocity_factor if damped else 0.0, project)
+                fill_tensor(w, own, lane_modulus, velocity_factor if damped else 0.0, project)
                 for block in range(6):
                     fill_block(w, columns[group], (0, 1, 1, 2, 2, 2)[block], (0, 0, 1, 0, 1, 2)[block])
                     for g in range(8):

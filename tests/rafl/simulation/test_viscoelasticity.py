@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from rafl.fem.constitutive_state import VISCOUS
 from rafl.fem.material import Material
 from rafl.fem.maxwell import branch_shares, branch_times, complex_modulus
 from rafl.fem.mesh import HexMesh
@@ -42,15 +41,15 @@ def shear_stress(simulator: Simulator, shear: np.ndarray, h: float, mode: str = 
         shape[:, 0] = 0.01 * (corners[:, 0] - 0.5) * (corners[:, 2] - 0.5)
     rest = torch.from_numpy(CELL.vertices[None])
     branches = parameters.branches(simulator.material.law, 1)
-    memory = ViscousMemory(torch.zeros(1, dtype=torch.float64), *branches, strains(rest, engine))
+    points = len(engine.quadrature.points.shape)
+    memory = ViscousMemory(torch.zeros(1, dtype=torch.float64), points, *branches, strains(rest, engine))
     hourglass = simulator.hourglass_stiffness(parameters, 1)
     found = []
     for amount in shear:
         q = rest + amount * torch.from_numpy(shape)
-        modulus, terms = memory.stress_terms(h)
         moduli = parameters.moduli(simulator.material.law, 1)
-        moduli[:, VISCOUS] = modulus
-        state = _constitutive_state(moduli, hourglass, terms, None, SolveContext(simulator, None))
+        viscous = memory.stress_terms(h)
+        state = _constitutive_state(moduli, None, hourglass, *viscous, None, SolveContext(simulator, None))
         force = engine.evaluate(q.numpy(), state, tangent=False)[1][0]
         memory = memory.after(strains(q, engine), h)
         found.append((force * shape).sum())
