@@ -56,6 +56,11 @@ class Recordings:
         same = simulator is self.dataset.simulator
         return self if same else replace(self, dataset=replace(self.dataset, simulator=simulator))
 
+    def select(self, chosen: list[int]) -> "Recordings":
+        """The recordings of the given indices."""
+        arrays = {key: getattr(self, key)[:, chosen] for key in ("markers", "valid", "weight")}
+        return replace(self, names=[self.names[k] for k in chosen], **arrays)
+
     def select_markers(self, chosen: NDArray[np.int64]) -> "Recordings":
         """The same recordings with only the given rows of markers."""
         dataset = replace(self.dataset, markers=self.dataset.markers.select(chosen))
@@ -92,17 +97,26 @@ def training_loss(recordings: Recordings, simulated: Tensor, forces: Tensor, for
 
     It is averaged over the recordings. Unobserved markers do not count.
     """
-    steps = recordings.valid[1:].amax(-1).sum(0).clamp_min(1.0)  # (B)
-    gap = (simulated - recordings.markers)[1:] ** 2 * recordings.weight[1:]
-    total = gap.sum((0, 2, 3))
+    losses = recording_losses(recordings, simulated)
     if forces.numel():
-        total = total + force_penalty * (forces**2).sum((0, 2, 3))
-    return LOSS_SCALE * (total / steps).mean()
+        losses = losses + LOSS_SCALE * force_penalty * (forces**2).sum((0, 2, 3)) / _observed_steps(recordings)
+    return losses.mean()
+
+
+def recording_losses(recordings: Recordings, simulated: Tensor) -> Tensor:
+    """`training_loss` of every recording without the forces, (B)."""
+    gap = (simulated - recordings.markers)[1:] ** 2 * recordings.weight[1:]
+    return LOSS_SCALE * gap.sum((0, 2, 3)) / _observed_steps(recordings)
+
+
+def _observed_steps(recordings: Recordings) -> Tensor:
+    """Number of steps of every recording with an observed marker, at least 1, (B)."""
+    return recordings.valid[1:].amax(-1).sum(0).clamp_min(1.0)
 
 
 def loss_curvature(recordings: Recordings, slope: Tensor) -> Tensor:
     """Gauss-Newton matrix (n, n) of `training_loss` without a penalty; slope of the markers (T, n, B, M, 3) [m]."""
-    steps = recordings.valid[1:].amax(-1).sum(0).clamp_min(1.0)  # (B)
+    steps = _observed_steps(recordings)
     weight = recordings.weight[1:] / steps[:, None, None]
     products = torch.einsum("tkbmi,tlbmi,tbmi->kl", slope[1:], slope[1:], weight)
     return 2.0 * LOSS_SCALE * products / len(steps)

@@ -5,9 +5,10 @@ from pathlib import Path
 
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
+from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Settings
 from rafl.fitting.supervised import fit_supervised, shared_vertex_count
-from rafl.fitting.sysid import METHOD_QUANTITIES, identify_material
+from rafl.fitting.sysid import fit_constitutive, identify_material
 from rafl.fitting.train_field import Report, fit_residual_field, load_start_model, training_items
 from rafl.simulation.time_integration import INTEGRATORS
 
@@ -17,6 +18,7 @@ METHODS: dict[str, FitFunction] = {
     "rafl": fit_residual_field,
     "srl": fit_supervised,
     **dict.fromkeys(METHOD_QUANTITIES, identify_material),
+    "constitutive": fit_constitutive,
 }
 # Default maximum number of passes over the recordings (iterations of sysid).
 DEFAULT_EPOCHS = {"rafl": 30, "srl": 1000, **dict.fromkeys(METHOD_QUANTITIES, 40)}

@@ -17,18 +17,13 @@ from rafl.fem.material import Material
 from rafl.fem.maxwell import branch_shares, complex_modulus
 from rafl.fem.mesh import HexMesh
 from rafl.fitting import train_field
+from rafl.fitting.material_search import Evaluation, MaterialSearch
 from rafl.fitting.methods import check_inputs
+from rafl.fitting.quantities import BRANCH_TIMES, LOSS_FREQUENCIES
 from rafl.fitting.residual_targets import residual_targets
 from rafl.fitting.run_folder import FittedModel, Settings, load_model, load_tensors, save_model, save_tensors
 from rafl.fitting.supervised import fit_supervised
-from rafl.fitting.sysid import (
-    BRANCH_TIMES,
-    LOSS_FREQUENCIES,
-    Evaluation,
-    _Search,
-    identify_material,
-    parameter_sentences,
-)
+from rafl.fitting.sysid import identify_material, parameter_sentences
 from rafl.fitting.train_field import (
     fit_residual_field,
     limit_frames,
@@ -222,8 +217,8 @@ def test_interrupted_identification_is_resumed(
             raise KeyboardInterrupt
 
     calls = []
-    simulate = _Search._simulate
-    monkeypatch.setattr(_Search, "_simulate", lambda self, x: (calls.append((self.frames, *x)), simulate(self, x))[1])
+    simulate = MaterialSearch._simulate
+    monkeypatch.setattr(MaterialSearch, "_simulate", lambda self, x: (calls.append((self.frames, *x)), simulate(self, x))[1])
     with pytest.raises(KeyboardInterrupt):
         identify_material([dataset], settings, broken, stop)
     identify_material([dataset], settings, broken, ignore)
@@ -257,14 +252,14 @@ def test_search_avoids_materials_that_cannot_be_simulated(
     dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     settings = replace(SETTINGS, method="sysid-e", epochs=6, frames=4)
-    original = _Search._simulate
+    original = MaterialSearch._simulate
 
-    def simulate(self: _Search, x: np.ndarray) -> Evaluation:
+    def simulate(self: MaterialSearch, x: np.ndarray) -> Evaluation:
         if np.exp(x[0]) > limit:
             raise SimulationError("too stiff")
         return original(self, x)
 
-    monkeypatch.setattr(_Search, "_simulate", simulate)
+    monkeypatch.setattr(MaterialSearch, "_simulate", simulate)
     limit = 1.05 * dataset.simulator.material.youngs_modulus
     model = identify_material([dataset], settings, tmp_path, ignore)
     assert model.material is not None

@@ -1,0 +1,105 @@
+"""What system identification finds: parameters of the material, their bounds and their priors."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from rafl.fem.learned_energy import UNITS as ENERGY_UNITS
+from rafl.fem.learned_viscosity import UNITS as VISCOSITY_UNITS
+from rafl.fem.maxwell import branch_shares, branch_times
+
+FIXED_POISSONS_RATIO = 0.499  # nearly incompressible; where only E is identified, as in the paper
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A parameter to identify, and the transformed variable in which the search is evenly scaled.
+
+    Attributes:
+        name: in `rafl.simulation.parameters.Parameters`, `tan_delta`, or one of a list: `branch_share_1` and so on.
+        low, high: bounds.
+        kind: the variable is, for a value p, `log`: log p; `gap`: log (1/2 - p); `linear`: p / scale.
+        unit: for messages.
+        scale: of `linear`, in the unit of the value.
+        start: value to start from if the assumed material has none, or less.
+        learned: whether the quantity is a weight of the constitutive residual. Its prior is a half-normal distribution
+            with a standard deviation of one unit of the variable.
+    """
+
+    name: str
+    low: float
+    high: float
+    kind: str
+    unit: str
+    scale: float = 1.0
+    start: float = 0.0
+    learned: bool = False
+
+    def variable(self, value: float) -> float:
+        """The variable of a value."""
+        if self.kind == "log":
+            return float(np.log(value))
+        return float(np.log(0.5 - value)) if self.kind == "gap" else value / self.scale
+
+    def value(self, variable: Any) -> Any:
+        """The value of a variable, a float or a tensor."""
+        exp = torch.exp if isinstance(variable, Tensor) else np.exp
+        if self.kind == "log":
+            return exp(variable)
+        return 0.5 - exp(variable) if self.kind == "gap" else self.scale * variable
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Lower and upper bound of the variable."""
+        a, b = self.variable(self.low), self.variable(self.high)
+        return min(a, b), max(a, b)
+
+
+MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa")
+POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "gap", "")
+VISCOSITY = Quantity("viscosity", 0.0, 1e4, "linear", "Pa s", scale=100.0, start=100.0)
+LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "linear", "", scale=0.1, start=0.1)
+LOSS_FREQUENCIES = (0.5, 50.0)  # [Hz]; from the slowest swings of large specimens to half of 100 frames/s
+BRANCH_TIMES = branch_times(*LOSS_FREQUENCIES)  # [s]
+SHARES = tuple(
+    Quantity(f"branch_share_{k + 1}", 0.0, 1.0, "linear", "", scale=0.1, start=0.05) for k in range(len(BRANCH_TIMES))
+)
+# Weights that change the stress by as much as the law has, or the loss factor by some hundredths, are unusual.
+ENERGY_WEIGHTS = tuple(
+    Quantity(f"energy_weight_{k + 1}", 0.0, 20.0, "linear", "", learned=True) for k in range(ENERGY_UNITS)
+)
+DISSIPATION_WEIGHTS = tuple(
+    Quantity(f"dissipation_weight_{k + 1}", 0.0, 1.0, "linear", "", scale=0.01, learned=True)
+    for k in range(VISCOSITY_UNITS)
+)
+METHOD_QUANTITIES = {
+    "sysid": (MODULUS, POISSON),
+    "sysid-e": (MODULUS,),
+    "sysid-damping": (MODULUS, POISSON, VISCOSITY),
+    "sysid-loss": (MODULUS, POISSON, LOSS_FACTOR),
+    "sysid-branches": (MODULUS, POISSON, VISCOSITY, *SHARES),
+    "constitutive": (MODULUS, POISSON, VISCOSITY, *SHARES, *ENERGY_WEIGHTS, *DISSIPATION_WEIGHTS),
+}
+# Lists of `rafl.simulation.parameters.Parameters`, and the quantities that are their elements.
+LISTS = {"branch_shares": SHARES, "energy_weights": ENERGY_WEIGHTS, "dissipation_weights": DISSIPATION_WEIGHTS}
+
+
+def material_values(identified: dict[str, Any]) -> dict[str, Any]:
+    """Values by their name in `rafl.simulation.parameters.Parameters` from those of quantities.
+
+    Values of quantities are floats or tensors (..); lists of K are (.., K).
+    """
+    values = {"poissons_ratio": FIXED_POISSONS_RATIO, **identified}
+    tan_delta = values.pop(LOSS_FACTOR.name, None)
+    for name, quantities in LISTS.items():
+        elements = [values.pop(quantity.name) for quantity in quantities if quantity.name in values]
+        if elements:
+            values[name] = torch.stack([torch.as_tensor(x, dtype=torch.float64) for x in elements], dim=-1)
+    if tan_delta is not None:
+        values["branch_shares"] = branch_shares(torch.as_tensor(tan_delta, dtype=torch.float64), *LOSS_FREQUENCIES)
+    if "branch_shares" in values:
+        values["branch_times"] = torch.tensor(BRANCH_TIMES, dtype=torch.float64)
+    return values
