@@ -9,7 +9,7 @@ from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 
-METHODS = ("rafl", "srl", "sysid", "sysid-e", "sysid-damping", "sysid-loss", "sysid-branches")
+METHODS = ("auto", "constitutive", "rafl", "srl", "sysid", "sysid-e", "sysid-damping", "sysid-loss", "sysid-branches")
 INTEGRATORS = ("implicit-euler", "generalised-alpha")
 DATASET = "a dataset (.h5, written by rafl-capture)"
 
@@ -24,11 +24,12 @@ def fit(
     method: Annotated[
         str,
         typer.Option(
-            help="rafl: residual field; srl: supervised baseline; sysid: E and nu, sysid-e: E at nu = 0.499, "
+            help="auto: the simplest of several models that predicts left-out recordings best; constitutive: material "
+            "with a learned strain energy and viscosity; rafl: residual field; srl: supervised baseline; sysid: E and nu, sysid-e: E at nu = 0.499, "
             "sysid-damping: E, nu and viscosity, sysid-loss: E, nu and loss factor, "
-            "sysid-branches: E, nu, viscosity and Maxwell branches."
+            "sysid-branches: E, nu and Maxwell branches."
         ),
-    ] = "rafl",
+    ] = "auto",
     out: Annotated[Path | None, typer.Option(help="Run folder [runs/DATASET-METHOD].")] = None,
     epochs: Annotated[
         int | None,

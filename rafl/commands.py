@@ -30,6 +30,7 @@ from rafl.evaluation.metrics import (
     split_table,
 )
 from rafl.evaluation.report import write_report
+from rafl.fitting.auto import SELECTION_FILE, selection_sentences
 from rafl.fitting.distributed import rank
 from rafl.fitting.fit import fit as fit_model
 from rafl.fitting.methods import DEFAULT_EPOCHS
@@ -74,6 +75,9 @@ def fit(
     if not first:
         return
     typer.echo(_describe(model))
+    if (run / SELECTION_FILE).exists():
+        for line in selection_sentences(pd.read_csv(run / SELECTION_FILE), model):
+            typer.echo(line)
     if (run / "parameters.csv").exists():
         for line in parameter_sentences(pd.read_csv(run / "parameters.csv")):
             typer.echo(line)

@@ -17,7 +17,7 @@ from rafl.fitting.warm_start import MAX_VERTICES
 def fit(
     datasets: str | Path | Sequence[str | Path],
     run: str | Path,
-    method: str = "rafl",
+    method: str = "auto",
     *,
     resume: bool = False,
     report: Report | None = None,
@@ -40,9 +40,11 @@ def fit(
     Args:
         datasets: dataset files, or one.
         run: folder for model.pt, history.csv, config.yaml and the checkpoint; must not hold a run yet.
-        method: `rafl` (residual acceleration field), `srl` (supervised baseline), `sysid` (E and nu), `sysid-e` (E at
-            nu = 0.499), `sysid-damping` (E, nu and viscosity), `sysid-loss` (E, nu and loss factor) or `sysid-branches`
-            (E, nu, viscosity and Maxwell branches).
+        method: `auto` (the simplest of several models that predicts left-out recordings best, see
+            `rafl.fitting.auto.fit_auto`), `constitutive` (material with a learned strain energy and viscosity), `rafl`
+            (residual acceleration field), `srl` (supervised baseline), `sysid` (E and nu), `sysid-e` (E at nu = 0.499),
+            `sysid-damping` (E, nu and viscosity), `sysid-loss` (E, nu and loss factor) or `sysid-branches` (E, nu
+            and Maxwell branches).
         resume: continue the interrupted run in the folder; the settings must be the same.
         report: called with every row of the history.
         notify: called with a message for every setting that has no effect.

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from rafl.common.errors import SimulationError
@@ -41,18 +41,21 @@ START_FACTORS = (0.6, 1.7)  # times the assumed E: further starting points
 # loss has other minima, where the simulation is whole oscillations ahead or behind.
 FRAME_FRACTIONS = (0.15, 0.4)
 MIN_FRAMES = 8
-ITERATIONS_PER_STAGE = 3
+EVALUATIONS_PER_STAGE = 4
+# Largest decrease of the loss, relative to it, that the model still expects where a search ends: of values that are
+# reported, of a model that is only compared, and of an early stage.
+EXACT, GOOD, EARLY = 1e-3, 1e-2, 0.1
 NORMAL_QUANTILE_95 = 1.959964  # a normal distribution has 95 % within this many sigmas
 FAILURE_LOSS = 1e6  # loss where a simulation fails
 MIN_LOSS = 1e-30  # smallest divisor, for a loss of zero
 DIFFERENCE_STEP = 1e-4  # of a variable, for the derivatives of the markers in the Gauss-Newton matrix
-# The Gauss-Newton matrix is that of a few recordings: of the least, the largest and medium motion. It is computed again
-# where a variable has moved by more than `CURVATURE_RANGE`, since it changes slowly; the gradient is always exact.
-CURVATURE_RECORDINGS = 3
-CURVATURE_RANGE = 0.25
+# The Gauss-Newton matrix is that of up to so many recordings, from the largest to the least motion, and of so many
+# simulations at most, as long as one recording remains.
+CURVATURE_RECORDINGS, CURVATURE_SIMULATIONS = 3, 24
 MIN_RELATIVE_CURVATURE = 1e-12  # of the Gauss-Newton matrix; directions of less are taken as undetermined
-# Largest decrease of the loss that Newton's method still expects where a search ended at a minimum, relative to it.
-MAX_EXPECTED_DECREASE = 1e-3
+# Gain of a step relative to the expected one between which the matrix is kept: it changes slowly.
+GOOD_MODEL = (0.5, 1.5)
+MIN_DAMPING = 0.1  # of Levenberg and Marquardt, relative to the matrix, after a step that fails
 
 
 @dataclass(frozen=True)
@@ -62,16 +65,12 @@ class Evaluation:
     Attributes:
         losses: of every recording, see `rafl.data.objective.recording_losses`, (R).
         gradients: of every recording's loss, exact, (R, n).
-        curvature: Gauss-Newton matrix of the mean loss, (n, n).
-        curvature_at: variables where the matrix was computed, (n).
-        prior: loss, gradient (n) and curvature (n), a diagonal, that the prior adds.
+        prior: loss and gradient (n) of the prior.
     """
 
     losses: list[float]
     gradients: list[list[float]]
-    curvature: list[list[float]]
-    curvature_at: list[float]
-    prior: tuple[float, list[float], list[float]] = (0.0, [], [])
+    prior: tuple[float, list[float]]
 
     @property
     def loss(self) -> float:
@@ -81,25 +80,23 @@ class Evaluation:
     @property
     def gradient(self) -> Array:
         """Of the loss, (n)."""
-        mean: Array = np.mean(self.gradients, axis=0)
-        return mean + np.array(self.prior[1]) if self.prior[1] else mean
+        total: Array = np.mean(self.gradients, axis=0) + np.array(self.prior[1])
+        return total
 
-    @property
-    def matrix(self) -> Array:
-        """Gauss-Newton matrix of the loss, prior included, (n, n)."""
-        own = np.array(self.curvature)
-        return own + np.diag(self.prior[2]) if self.prior[2] else own
 
-    @property
-    def equivalent_residuals(self) -> tuple[Array, Array]:
-        """Residuals r (n + 1) and slopes J (n + 1, n) with r^2 / 2 = loss, J^T r = gradient and J^T J = matrix."""
-        values, vectors = np.linalg.eigh(self.matrix)
-        roots = np.sqrt(np.maximum(values, MIN_RELATIVE_CURVATURE * max(values[-1], MIN_LOSS)))
-        along = vectors.T @ self.gradient / roots
-        # Rounding and the differences may leave less loss than the gradient implies.
-        along *= min(1.0, np.sqrt(2.0 * self.loss / max(along @ along, MIN_LOSS)))
-        rest = np.sqrt(max(2.0 * self.loss - along @ along, 0.0))
-        return np.append(along, rest), np.vstack([roots[:, None] * vectors.T, np.zeros(len(roots))])
+@dataclass(frozen=True)
+class Minimum:
+    """Where a search ended.
+
+    Attributes:
+        x: the variables, (n).
+        loss: at x, prior included.
+        curvature: Gauss-Newton matrix of the recordings' mean loss, computed at x or near it, (n, n).
+    """
+
+    x: Array
+    loss: float
+    curvature: Array
 
 
 @dataclass
@@ -126,7 +123,7 @@ class MaterialSearch:
         quantities: to search for.
         history: of the run.
         checkpoint: file of earlier evaluations, which are not repeated.
-        prior_weight: of the prior of learned quantities in the loss, see `prior`.
+        prior_weight: second derivative of the loss by each learned quantity's variable that the prior adds.
     """
 
     def __init__(
@@ -146,12 +143,13 @@ class MaterialSearch:
         self.simulator = used[0].simulator
         self.frames = 0  # number of frames to simulate
         self.evaluations: dict[tuple[float, ...], Evaluation] = {}  # by frames and variables
-        self._latest: tuple[int, Evaluation] | None = None  # frames and evaluation whose matrix may serve again
+        self.curvatures: dict[tuple[float, ...], Array] = {}
         self.checkpoint = checkpoint
         if checkpoint.exists():
             saved = load_tensors(checkpoint, "a checkpoint of this run")
             with expect_content("a checkpoint of this version", checkpoint):
                 self.evaluations = {tuple(key): Evaluation(*values) for key, *values in saved["known"]}
+                self.curvatures = {tuple(key): np.array(value) for key, value in saved["curvatures"]}
 
     @property
     def recording_names(self) -> list[str]:
@@ -163,15 +161,15 @@ class MaterialSearch:
         longest = max(len(recordings.markers) for recordings in self.training)
         self.frames = min(max(int(fraction * longest), MIN_FRAMES), longest)
 
-    def solve(self) -> Array:
-        """The best variables, from several starting points: first by the leading frames, finally by all."""
+    def solve(self, tolerance: float = EXACT) -> Minimum:
+        """The best minimum, from several starting points: first by the leading frames, finally by all."""
         points = self.starting_points()
         for fraction in FRAME_FRACTIONS:
             self.use_frames(fraction)
-            results = (self.descend(point, ITERATIONS_PER_STAGE) for point in points)
-            points = [min(results, key=lambda result: result[0])[1]]
+            results = (self.descend(point, EVALUATIONS_PER_STAGE, EARLY) for point in points)
+            points = [min(results, key=lambda result: result.loss).x]
         self.use_frames(1.0)
-        return self.descend(points[0], max(self.settings.epochs - ITERATIONS_PER_STAGE * len(FRAME_FRACTIONS), 1))[1]
+        return self.descend(points[0], self.settings.epochs, tolerance)
 
     def starting_points(self) -> list[Array]:
         """Variables to start from; those of the assumed material come first."""
@@ -202,26 +200,31 @@ class MaterialSearch:
 
     def evaluate(self, x: Array) -> Evaluation:
         """The loss at variables x, from the checkpoint or else simulated; very high where a simulation fails."""
-        key = (float(self.frames), *(float(value) for value in x))
+        key = self._key(x)
         if key not in self.evaluations:
             try:
                 self.evaluations[key] = self._simulate(x)
             except SimulationError:
                 if not self.evaluations:
                     raise
-                n, count = len(x), len(self.recording_names)
-                return Evaluation([FAILURE_LOSS] * count, [[0.0] * n] * count, np.eye(n).tolist(), x.tolist())
-            content = [[list(each), *vars(known).values()] for each, known in self.evaluations.items()]
-            save_tensors(self.checkpoint, {"format": FORMAT, "method": self.settings.method, "known": content})
-        self._latest = self.frames, self.evaluations[key]
+                count = len(self.recording_names)
+                return Evaluation([FAILURE_LOSS] * count, [[0.0] * len(x)] * count, self.prior(x))
+            self._save()
         return self.evaluations[key]
+
+    def _key(self, x: Array) -> tuple[float, ...]:
+        return (float(self.frames), *(float(value) for value in x))
+
+    def _save(self) -> None:
+        known = [[list(key), *vars(value).values()] for key, value in self.evaluations.items()]
+        curvatures = [[list(key), value.tolist()] for key, value in self.curvatures.items()]
+        content = {"format": FORMAT, "method": self.settings.method, "known": known, "curvatures": curvatures}
+        save_tensors(self.checkpoint, content)
 
     def _simulate(self, x: Array) -> Evaluation:
         losses: list[float] = []
         gradients: list[list[float]] = []
-        positions: list[Tensor] = []
-        cut = [recordings.first_frames(self.frames) for recordings in self.training]
-        for recordings in cut:
+        for recordings in (each.first_frames(self.frames) for each in self.training):
             variables = torch.tensor(x, dtype=torch.float64)[:, None].repeat(1, len(recordings.names)).requires_grad_()
             simulated, _ = recordings.simulate(parameters=self.parameters(variables, recordings))
             own = recording_losses(recordings, simulated)
@@ -229,74 +232,79 @@ class MaterialSearch:
             assert variables.grad is not None
             losses += own.tolist()
             gradients += variables.grad.T.tolist()
-            positions.append(simulated.detach())
-        curvature, at = self._known_curvature(x)
-        if curvature is None:
-            share = max(CURVATURE_RECORDINGS // len(cut), 1)
-            parts = [self._gauss_newton_matrix(x, each, q, share) for each, q in zip(cut, positions, strict=True)]
-            weights = [len(recordings.names) for recordings in cut]
-            curvature, at = np.average(parts, axis=0, weights=weights).tolist(), x.tolist()
-        return Evaluation(losses, gradients, curvature, at, self.prior(x))
+        return Evaluation(losses, gradients, self.prior(x))
 
-    def _known_curvature(self, x: Array) -> tuple[list[list[float]] | None, list[float]]:
-        """The latest matrix and where it was computed, if that was near x with as many frames."""
-        if self._latest is None or self._latest[0] != self.frames:
-            return None, []
-        known = self._latest[1]
-        near = np.abs(x - np.array(known.curvature_at)).max() <= CURVATURE_RANGE
-        return (known.curvature, known.curvature_at) if near else (None, [])
+    def prior(self, x: Array) -> tuple[float, list[float]]:
+        """Loss and gradient (n) of the prior: half the sum of `prior_curvature` times the squared variables."""
+        return 0.5 * float(self.prior_curvature @ x**2), (self.prior_curvature * x).tolist()
 
-    def prior(self, x: Array) -> tuple[float, list[float], list[float]]:
-        """Loss, gradient (n) and diagonal of the curvature (n) of the prior: prior_weight / 2 times the sum of squares
-        of the learned quantities' variables."""
-        if not self.prior_weight:
-            return 0.0, [], []
-        weight = self.prior_weight * np.array([float(quantity.learned) for quantity in self.quantities])
-        return 0.5 * float(weight @ x**2), (weight * x).tolist(), weight.tolist()
+    @property
+    def prior_curvature(self) -> Array:
+        """Second derivatives of the prior by each variable, (n): the same for all learned quantities, else zero."""
+        return self.prior_weight * np.array([float(quantity.learned) for quantity in self.quantities])
 
-    def _gauss_newton_matrix(self, x: Array, recordings: Recordings, simulated: Tensor, count: int) -> Array:
-        """Mean over `count` recordings of the Gauss-Newton matrix (n, n); all differences are simulated as one batch.
+    def curvature(self, x: Array) -> Array:
+        """Gauss-Newton matrix of the recordings' mean loss at x, (n, n), by differences, from a few recordings."""
+        key = self._key(x)
+        if key not in self.curvatures:
+            recordings = min(CURVATURE_RECORDINGS, CURVATURE_SIMULATIONS // len(x))
+            share = max(recordings // len(self.training), 1)
+            cut = [recordings.first_frames(self.frames) for recordings in self.training]
+            parts = [self._gauss_newton_matrix(x, recordings, share) for recordings in cut]
+            self.curvatures[key] = np.average(parts, axis=0, weights=[len(recordings.names) for recordings in cut])
+            self._save()
+        return self.curvatures[key]
 
-        simulated: markers of all recordings at x, (T, B, M, 3).
-        """
-        chosen = _spread_by_motion(recordings, count)
-        few = recordings.select(chosen)
-        changed = torch.from_numpy(x + DIFFERENCE_STEP * np.eye(len(x)))  # (n, n), one set of variables a row
+    def _gauss_newton_matrix(self, x: Array, recordings: Recordings, count: int) -> Array:
+        """Mean over `count` recordings of the Gauss-Newton matrix (n, n); all differences are simulated as one batch."""
+        few = recordings.select(_spread_by_motion(recordings, count))
+        sets = x + DIFFERENCE_STEP * np.vstack([np.zeros(len(x)), np.eye(len(x))])
         batch = len(few.names)
-        variables = changed.T.repeat_interleave(batch, dim=1)  # every set with every recording, (n, n batch)
-        simulator, start = few.dataset.simulator, few.dataset.start(few.names * len(x))
+        variables = torch.from_numpy(sets.T).repeat_interleave(batch, dim=1)  # every set with every recording
+        start = few.dataset.start(few.names * len(sets))
         with torch.no_grad():
             parameters = self.parameters(variables, few)
-            positions, _ = rollout(simulator, start, len(few.markers) - 1, parameters=parameters)
+            positions, _ = rollout(few.dataset.simulator, start, len(few.markers) - 1, parameters=parameters)
             markers = few.dataset.markers.positions(positions)
-        shape = (len(markers), len(x), batch, *markers.shape[2:])
-        slope = (markers.reshape(shape) - simulated[:, None, chosen]) / DIFFERENCE_STEP
-        matrix: Array = loss_curvature(few, slope).numpy()
+        markers = markers.reshape(len(markers), len(sets), batch, *markers.shape[2:])
+        matrix: Array = loss_curvature(few, (markers[:, 1:] - markers[:, :1]) / DIFFERENCE_STEP).numpy()
         return matrix
 
-    def descend(self, start: Array, evaluations: int) -> tuple[float, Array]:
-        """Minimise by trust-region least squares within bounds from a starting point; the loss and the variables."""
+    def descend(self, start: Array, evaluations: int, tolerance: float = EXACT) -> Minimum:
+        """Minimise within bounds from a starting point by the Levenberg-Marquardt method.
+
+        Every step minimises a quadratic model of the loss with the exact gradient and a Gauss-Newton matrix. The matrix
+        is computed again if the model foretold a step's gain badly. The search ends where the model expects to gain
+        less than `tolerance` times the loss, or after a number of evaluations.
+        """
         if not self.history.rows:
             self.record(start)
-
-        def slopes(x: Array) -> Array:
-            if (x != start).any():  # called where a step was accepted
-                self.record(x)
-            return self.evaluate(x).equivalent_residuals[1]
-
         lows, highs = self.bounds
-        result = least_squares(
-            lambda x: self.evaluate(x).equivalent_residuals[0],
-            start,
-            slopes,
-            bounds=(lows, highs),
-            x_scale="jac",
-            ftol=1e-9,
-            xtol=1e-7,
-            gtol=1e-12,
-            max_nfev=evaluations,
-        )
-        return self.evaluate(result.x).loss, result.x
+        x, found, matrix = start, self.evaluate(start), self.curvature(start)
+        at, damping = start, 0.0  # where the matrix was computed; relative to the matrix
+        for _ in range(evaluations):
+            model = matrix + np.diag(self.prior_curvature)
+            scale = np.maximum(np.diag(model), MIN_RELATIVE_CURVATURE * max(model.max(), MIN_LOSS))
+            step = _bounded_step(model + np.diag(damping * scale), found.gradient, lows - x, highs - x)
+            expected = -(found.gradient @ step + 0.5 * step @ model @ step)
+            converged = not expected > tolerance * found.loss
+            # A model of another point may expect more than there is, or the wrong minimum.
+            if (converged or expected > found.loss) and (at != x).any() and tolerance < EARLY:
+                matrix, at, damping = self.curvature(x), x, 0.0
+                continue
+            if converged:
+                break
+            trial = self.evaluate(np.clip(x + step, lows, highs))
+            gained = (found.loss - trial.loss) / expected
+            if gained > 0.0:
+                x, found = np.clip(x + step, lows, highs), trial
+                self.record(x)
+                damping = damping / 4.0 if gained > GOOD_MODEL[0] else max(damping, MIN_DAMPING)
+            else:
+                damping = max(4.0 * damping, MIN_DAMPING)
+            if not GOOD_MODEL[0] <= gained <= GOOD_MODEL[1] and (at != x).any():
+                matrix, at = self.curvature(x), x
+        return Minimum(x, found.loss, matrix)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -318,29 +326,35 @@ class MaterialSearch:
         margin = 1e-3 * (highs - lows)
         return np.flatnonzero((lows + margin < x) & (x < highs - margin))
 
-    def covariance(self, x: Array) -> Array:
-        """Covariance of the variables at a minimum x, (n, n); NaN where a variable is at its bound, or at no minimum.
+    def covariance(self, minimum: Minimum) -> Array:
+        """Covariance of the variables, (n, n); NaN where a variable is at its bound, and where the search ended early.
 
         Marker errors are assumed independent and as large as the residuals of the fit; the Gauss-Newton matrix then
         gives the information matrix.
         """
-        inside = self.inside(x)
-        covariance = np.full((len(x), len(x)), np.nan)
-        found = self.evaluate(x)
-        matrix, gradient = found.matrix[np.ix_(inside, inside)], found.gradient[inside]
+        inside = self.inside(minimum.x)
+        covariance = np.full((len(minimum.x), len(minimum.x)), np.nan)
+        found = self.evaluate(minimum.x)
+        matrix = (minimum.curvature + np.diag(self.prior_curvature))[np.ix_(inside, inside)]
+        gradient = found.gradient[inside]
         if len(inside) and np.linalg.eigvalsh(matrix)[0] > MIN_RELATIVE_CURVATURE * np.trace(matrix):
             inverse = np.linalg.inv(matrix)
-            if gradient @ inverse @ gradient <= 2.0 * MAX_EXPECTED_DECREASE * found.loss:
-                observed = sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.training)
-                covariance[np.ix_(inside, inside)] = 2.0 * found.loss / max(observed - len(x), 1.0) * inverse
+            if gradient @ inverse @ gradient <= 2.0 * GOOD * found.loss:
+                freedom = max(self.observed - len(minimum.x), 1.0)
+                covariance[np.ix_(inside, inside)] = 2.0 * found.loss / freedom * inverse
         return covariance
 
-    def parameter_table(self, x: Array) -> str:
-        """CSV text with each value, its 95 % interval and its correlations with the others; learned weights last.
+    @property
+    def observed(self) -> float:
+        """Number of coordinates that were observed."""
+        return sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.training)
+
+    def parameter_table(self, minimum: Minimum) -> str:
+        """CSV text with each value, its 95 % interval and its correlations with the others.
 
         A value at its bound has no interval. No value has one if the search ended before a minimum.
         """
-        covariance = self.covariance(x)
+        x, covariance = minimum.x, self.covariance(minimum)
         sigma = np.sqrt(np.diag(covariance))
         names = [q.name for q in self.quantities]
         lines = ["name,unit,value,low_95,high_95," + ",".join(f"correlation_{name}" for name in names)]
@@ -352,26 +366,21 @@ class MaterialSearch:
             lines.append(f"{q.name},{q.unit}," + ",".join("" if np.isnan(cell) else f"{cell:.6g}" for cell in cells))
         return "\n".join(lines) + "\n"
 
-    def left_out_errors(self, x: Array, groups: list[list[int]]) -> list[float]:
-        """Mean marker error [m] of every group of training recordings, predicted without it; x is a minimum of all.
+    def left_out_errors(self, minimum: Minimum, groups: list[list[int]]) -> list[float]:
+        """Mean marker error [m] of every group of training recordings, predicted without it.
 
-        groups: indices into `recording_names`. A group's variables are those after one Gauss-Newton step towards the
-        minimum of the other recordings, within the bounds.
+        groups: indices into `recording_names`. A group's variables are those after one Gauss-Newton step from the
+        minimum of all recordings towards that of the others, within the bounds.
         """
-        found, count = self.evaluate(x), len(self.recording_names)
-        gradients, inside = np.array(found.gradients), self.inside(x)
+        x, found, count = minimum.x, self.evaluate(minimum.x), len(self.recording_names)
+        gradients = np.array(found.gradients)
         lows, highs = self.bounds
         variables = np.repeat(x[:, None], count, axis=1)
-        prior = np.array(found.prior[2]) if found.prior[2] else np.zeros(len(x))
         for group in groups:
-            left = 1.0 - len(group) / count
-            matrix = left * np.array(found.curvature) + np.diag(prior)
-            scale = np.sqrt(np.maximum(np.diag(matrix), MIN_LOSS))
-            matrix += np.diag(MIN_RELATIVE_CURVATURE * scale**2)
+            matrix = (1.0 - len(group) / count) * minimum.curvature + np.diag(self.prior_curvature)
             slope = found.gradient - gradients[group].sum(0) / count
-            moved = x.copy()
-            moved[inside] -= np.linalg.solve(matrix[np.ix_(inside, inside)], slope[inside])
-            variables[:, group] = np.clip(moved, lows, highs)[:, None]
+            step = _bounded_step(matrix, slope, lows - x, highs - x)
+            variables[:, group] = np.clip(x + step, lows, highs)[:, None]
         errors = np.concatenate(self._errors(variables))
         return [float(errors[group].mean()) for group in groups]
 
@@ -385,6 +394,17 @@ class MaterialSearch:
                 simulated, _ = recordings.simulate(parameters=self.parameters(own, recordings))
             errors.append(np.array([each.mean() for each in frame_errors(recordings, simulated)]))
         return errors
+
+
+def _bounded_step(matrix: Array, gradient: Array, low: Array, high: Array) -> Array:
+    """The step d (n) with low <= d <= high that minimises gradient . d + d . matrix d / 2."""
+    values, vectors = np.linalg.eigh(matrix)
+    roots = np.sqrt(np.maximum(values, MIN_RELATIVE_CURVATURE * max(values[-1], MIN_LOSS)))
+    right = -(vectors.T @ gradient) / roots
+    margin = 1e-15 + 1e-12 * (high - low)  # bounds that meet at zero leave the solver no room
+    found = lsq_linear(roots[:, None] * vectors.T, right, (low - margin, high + margin), method="bvls")
+    step: Array = np.clip(found.x, low, high)
+    return step
 
 
 def _spread_by_motion(recordings: Recordings, count: int) -> list[int]:

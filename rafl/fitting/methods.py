@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
+from rafl.fitting.auto import fit_auto
 from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Settings
 from rafl.fitting.supervised import fit_supervised, shared_vertex_count
@@ -15,13 +16,14 @@ from rafl.simulation.time_integration import INTEGRATORS
 FitFunction = Callable[[list[Dataset], Settings, Path, Report], FittedModel]
 
 METHODS: dict[str, FitFunction] = {
+    "auto": fit_auto,
     "rafl": fit_residual_field,
     "srl": fit_supervised,
     **dict.fromkeys(METHOD_QUANTITIES, identify_material),
     "constitutive": fit_constitutive,
 }
 # Default maximum number of passes over the recordings (iterations of sysid).
-DEFAULT_EPOCHS = {"rafl": 30, "srl": 1000, **dict.fromkeys(METHOD_QUANTITIES, 40)}
+DEFAULT_EPOCHS = {"auto": 40, "rafl": 30, "srl": 1000, **dict.fromkeys(METHOD_QUANTITIES, 40)}
 
 
 def check_inputs(method: str, datasets: list[Dataset], start: Path | None, integrator: str) -> None:

@@ -23,6 +23,7 @@ from rafl.simulation.time_integration import INTEGRATORS
 
 FORMAT = "rafl-run/1"
 TIME_INTEGRATION_KEY = "stepping"  # in model.pt
+SEEN_KEY = "seen"
 
 
 # A residual model of a user's own: makes the residual force on the mesh of a simulator.
@@ -42,6 +43,8 @@ class FittedModel:
         time_integration: `integrator` and `substeps` of the simulator that the model was fitted in; None for the
             specimen's own.
         own: a residual model that was not fitted by this package. It is not saved.
+        seen: strain and strain rate [1/s] that the training recordings reach, see `rafl.data.strain_range`; None if
+            they were not determined.
     """
 
     method: str
@@ -50,6 +53,7 @@ class FittedModel:
     network: GlobalResidual | None = None
     time_integration: dict[str, Any] | None = None
     own: ResidualModel | None = None
+    seen: tuple[float, float] | None = None
 
     def simulator(self, own: Simulator) -> Simulator:
         """A specimen's simulator with the time integration that this model was fitted with."""
@@ -181,6 +185,8 @@ def save_model(run: Path, model: FittedModel) -> None:
         content["material"] = dict(model.material)
     if model.time_integration is not None:
         content[TIME_INTEGRATION_KEY] = dict(model.time_integration)
+    if model.seen is not None:
+        content[SEEN_KEY] = list(model.seen)
     if model.network is not None:
         content |= {"nodes": model.network.nodes, "network": model.network.state_dict()}
     save_tensors(run / "model.pt", content)
@@ -210,7 +216,9 @@ def load_model(run: str | Path) -> FittedModel:
         if "field" in content:
             field = ResidualField()
             field.restore(content["field"])
-    return FittedModel(content["method"], field, material, network, integration)
+        strain, rate = map(float, content.get(SEEN_KEY, (0.0, 0.0)))
+        seen = (strain, rate) if SEEN_KEY in content else None
+    return FittedModel(content["method"], field, material, network, integration, seen=seen)
 
 
 def _is_time_integration(content: Any) -> bool:

@@ -8,7 +8,7 @@ import pandas as pd
 
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.fitting.material_search import Array, History, MaterialSearch
+from rafl.fitting.material_search import Array, History, MaterialSearch, Minimum
 from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
 from rafl.fitting.train_field import Report
@@ -52,18 +52,16 @@ def fit_constitutive(datasets: list[Dataset], settings: Settings, run: Path, rep
     below = MaterialSearch(
         datasets, settings, METHOD_QUANTITIES[MATERIAL_BELOW], history, run / "checkpoint-material.pt"
     )
-    x = below.solve()
-    search = add_constitutive_residual(below, x, datasets, run / "checkpoint.pt")
-    _, best = search.descend(extended(x, search), settings.epochs)
-    return _save(search, best, run)
+    minimum = below.solve()
+    search = add_constitutive_residual(below, minimum, datasets, run / "checkpoint.pt")
+    return _save(search, search.descend(extended(minimum.x, search), settings.epochs), run)
 
 
 def add_constitutive_residual(
-    below: MaterialSearch, x: Array, datasets: list[Dataset], checkpoint: Path
+    below: MaterialSearch, minimum: Minimum, datasets: list[Dataset], checkpoint: Path
 ) -> MaterialSearch:
-    """A search for a constitutive residual too, after a search for the material that ended at variables x."""
-    observed = sum(float((recordings.weight[1:] > 0).sum()) for recordings in below.training)
-    weight = PRIOR_OBSERVATIONS * 2.0 * below.evaluate(x).loss / observed
+    """A search for a constitutive residual too, after a search for the material that ended at a minimum."""
+    weight = PRIOR_OBSERVATIONS * 2.0 * minimum.loss / below.observed
     quantities = METHOD_QUANTITIES["constitutive"]
     search = MaterialSearch(datasets, below.settings, quantities, below.history, checkpoint, weight)
     search.use_frames(1.0)
@@ -75,10 +73,10 @@ def extended(x: Array, search: MaterialSearch) -> Array:
     return np.concatenate([x, np.zeros(len(search.quantities) - len(x))])
 
 
-def _save(search: MaterialSearch, x: Array, run: Path) -> FittedModel:
-    model = search.model(x)
+def _save(search: MaterialSearch, minimum: Minimum, run: Path) -> FittedModel:
+    model = search.model(minimum.x)
     save_model(run, model)
-    write_text(run / "parameters.csv", search.parameter_table(x))
+    write_text(run / "parameters.csv", search.parameter_table(minimum))
     return model
 
 

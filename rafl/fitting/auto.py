@@ -1,0 +1,239 @@
+"""The default fit: several models from simple to complex, judged on recordings that each of them has not seen."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import NDArray
+
+from rafl.common.errors import SimulationError
+from rafl.common.files import write_text
+from rafl.data.dataset import Dataset
+from rafl.data.objective import Recordings, frame_errors
+from rafl.data.strain_range import StrainRange
+from rafl.fitting.material_search import GOOD, Array, History, MaterialSearch, Minimum
+from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, MODULUS, POISSON, material_values
+from rafl.fitting.run_folder import FittedModel, Settings, save_model
+from rafl.fitting.sysid import add_constitutive_residual, extended
+from rafl.fitting.train_field import Report, training_items
+from rafl.simulation.rollout import rollout
+
+SELECTION_FILE = "selection.csv"
+ASSUMED = "original"
+FREE_RUN = 3.0  # [s] for which the recording of the largest motion is simulated
+# Without a second recording to judge by, a model must lower the error by this much to be kept.
+MIN_GAIN = 0.1
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model and its errors on recordings that it has not seen.
+
+    Attributes:
+        name: `original` for the assumed material, or a method.
+        model: the model, fitted to all training recordings.
+        errors: mean marker error of each recording or dataset that was left out [m], (G).
+    """
+
+    name: str
+    model: FittedModel
+    errors: NDArray[np.float64]
+
+
+def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
+    """Identify the material, fit a constitutive residual on top, and keep the simplest model that predicts as well.
+
+    The candidates are the assumed material; E, nu and a loss factor; E, nu, viscosity and Maxwell branches; and these
+    with a learned strain energy and viscosity. Each is judged by its error on the validation recordings and on every
+    training recording as predicted from the others; with several datasets, on every dataset as predicted from the
+    others. A candidate is kept if no later one has a smaller error by more than the standard error of the difference,
+    and if a free run of some seconds does not gain energy.
+
+    `selection.csv` in the run holds the errors of all candidates.
+
+    Raises:
+        InputError: no training recordings.
+        SimulationError: the assumed material itself cannot be simulated.
+    """
+    training_items(datasets)
+    history = History(run, report)
+    judge = _Judge(datasets)
+    model = FittedModel(ASSUMED)
+    candidates = [Candidate(ASSUMED, model, judge.assumed_errors(model))]
+
+    def consider(name: str, search: MaterialSearch, minimum: Minimum) -> None:
+        fitted = replace(search.model(minimum.x), method=name)
+        if judge.stays_calm(fitted):
+            candidates.append(Candidate(name, fitted, judge.errors(fitted, search, minimum)))
+            write_text(run / f"parameters-{name}.csv", search.parameter_table(minimum))
+
+    loss = MaterialSearch(
+        datasets, settings, METHOD_QUANTITIES["sysid-loss"], history, run / "checkpoint-sysid-loss.pt"
+    )
+    minimum = loss.solve(GOOD)
+    consider("sysid-loss", loss, minimum)
+    branches = MaterialSearch(
+        datasets, settings, METHOD_QUANTITIES["sysid-branches"], history, run / "checkpoint-sysid-branches.pt"
+    )
+    branches.use_frames(1.0)
+    minimum = branches.descend(_with_branches(loss.identified(minimum.x)), settings.epochs, GOOD)
+    consider("sysid-branches", branches, minimum)
+    learned = add_constitutive_residual(branches, minimum, datasets, run / "checkpoint-constitutive.pt")
+    minimum = learned.descend(extended(minimum.x, learned), settings.epochs, GOOD)
+    consider("constitutive", learned, minimum)
+
+    chosen = choose(candidates, judge.groups)
+    write_text(run / SELECTION_FILE, _table(candidates, chosen).to_csv(index=False, float_format="%.6g"))
+    kept = replace(chosen.model, seen=judge.seen(chosen.model))
+    save_model(run, kept)
+    parameters = run / f"parameters-{chosen.name}.csv"
+    if parameters.exists():
+        write_text(run / "parameters.csv", parameters.read_text())
+    return kept
+
+
+def _with_branches(identified: dict[str, float]) -> Array:
+    """Variables of `sysid-branches` for the same material as that of `sysid-loss`."""
+    shares = material_values({LOSS_FACTOR.name: identified[LOSS_FACTOR.name]})["branch_shares"]
+    values = [identified[MODULUS.name], identified[POISSON.name], *shares.tolist()]
+    quantities = METHOD_QUANTITIES["sysid-branches"]
+    return np.array([np.clip(q.variable(x), *q.bounds) for q, x in zip(quantities, values, strict=True)])
+
+
+def choose(candidates: list[Candidate], groups: int) -> Candidate:
+    """The first candidate that no later one beats by more than the standard error of the mean difference.
+
+    groups: number of recordings or datasets that were left out; without any, the identified material of fewest
+    parameters is kept.
+    """
+    if groups == 0:
+        return candidates[min(1, len(candidates) - 1)]
+    for k, simple in enumerate(candidates):
+        gains = [simple.errors - other.errors for other in candidates[k + 1 :]]
+        if not any(gain.mean() > _uncertainty(gain, simple.errors) for gain in gains):
+            return simple
+    return candidates[-1]
+
+
+def _uncertainty(gain: NDArray[np.float64], error: NDArray[np.float64]) -> float:
+    """Standard error of a mean gain; of a single one, the gain that counts."""
+    if len(gain) == 1:
+        return MIN_GAIN * float(error[0])
+    return float(gain.std(ddof=1) / np.sqrt(len(gain)))
+
+
+def _table(candidates: list[Candidate], chosen: Candidate) -> pd.DataFrame:
+    rows = []
+    for item in candidates:
+        count = len(item.errors)
+        rows.append(
+            {
+                "model": item.name,
+                "left_out_mm": 1e3 * item.errors.mean() if count else np.nan,
+                "standard_error_mm": 1e3 * item.errors.std(ddof=1) / np.sqrt(count) if count > 1 else np.nan,
+                "left_out": count,
+                "kept": item is chosen,
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def selection_sentences(table: pd.DataFrame, model: FittedModel) -> list[str]:
+    """Two sentences: what was kept and how sure it is, and where it is a guess; `table` is `selection.csv`."""
+    kept = table[table["kept"]].iloc[0]
+    others = ", ".join(f"{row.model} {row.left_out_mm:.3g} mm" for row in table.itertuples() if not row.kept)
+    if kept["left_out"] == 0:
+        first = f"kept {kept['model']}, of few parameters, because no second recording was there to judge by."
+    else:
+        spread = f" +- {kept['standard_error_mm']:.2g}" if np.isfinite(kept["standard_error_mm"]) else ""
+        first = (
+            f"kept {kept['model']}: on what was left out ({kept['left_out']:.0f} in turn) its error is "
+            f"{kept['left_out_mm']:.3g}{spread} mm ({others})."
+        )
+    if model.seen is None:
+        return [first]
+    strain, rate = model.seen
+    second = (
+        f"It has seen strains up to {100 * strain:.2g} % and {rate:.2g} 1/s: for shapes or loads that strain the body "
+        "more, such as thinner or longer ones, it is a guess."
+    )
+    return [first, second]
+
+
+class _Judge:
+    """What candidates are judged by: recordings left out of the training, and free runs."""
+
+    def __init__(self, datasets: list[Dataset]) -> None:
+        self.datasets = datasets
+        self.training = [Recordings.of(d, d.split("train")) for d in datasets if d.split("train")]
+        self.validation = [Recordings.of(d, d.split("val")) for d in datasets if d.split("val")]
+        counts = [len(recordings.names) for recordings in self.training]
+        indices = np.split(np.arange(sum(counts)), np.cumsum(counts)[:-1])
+        by_dataset = len(counts) > 1
+        chosen = indices if by_dataset else [np.array([k]) for k in indices[0]]
+        self.left_out: list[list[int]] = [each.tolist() for each in chosen] if len(chosen) > 1 else []
+        self.groups = len(self.left_out) + sum(len(recordings.names) for recordings in self.validation)
+
+    def assumed_errors(self, model: FittedModel) -> NDArray[np.float64]:
+        """Errors [m] of a model that was not fitted, on the same groups as those of the others, (G)."""
+        own = self._simulated_errors(self.training, model)
+        grouped = [own[group].mean() for group in self.left_out]
+        return np.concatenate([grouped, self._simulated_errors(self.validation, model)])
+
+    def errors(self, model: FittedModel, search: MaterialSearch, minimum: Minimum) -> NDArray[np.float64]:
+        """Errors [m] of a model where a search ended, on what was left out, (G)."""
+        grouped = search.left_out_errors(minimum, self.left_out) if self.left_out else []
+        return np.concatenate([grouped, self._simulated_errors(self.validation, model)])
+
+    def _simulated_errors(self, batches: list[Recordings], model: FittedModel) -> NDArray[np.float64]:
+        errors: list[float] = []
+        for recordings in batches:
+            simulator = model.simulator(recordings.dataset.simulator)
+            with torch.no_grad():
+                simulated, _ = recordings.in_simulator(simulator).simulate(parameters=model.parameters(simulator))
+            errors += [float(each.mean()) for each in frame_errors(recordings, simulated)]
+        return np.array(errors)
+
+    def stays_calm(self, model: FittedModel) -> bool:
+        """Whether a free run of the recording of the largest motion ends, and ends slower than it began."""
+        recordings = max(self.training, key=_largest_motion)
+        own = int(np.argmax(_motions(recordings)))
+        simulator = model.simulator(recordings.dataset.simulator)
+        start = recordings.dataset.start([recordings.names[own]])
+        steps = round(FREE_RUN / simulator.time_step)
+        try:
+            with torch.no_grad():
+                positions, _ = rollout(simulator, start, steps, parameters=model.parameters(simulator))
+        except SimulationError:
+            return False
+        speed = torch.diff(positions, dim=0).square().sum((1, 2, 3))
+        quarter = max(steps // 4, 1)
+        return bool(speed[-quarter:].mean() <= speed[:quarter].mean())
+
+    def seen(self, model: FittedModel) -> tuple[float, float]:
+        """Strain and strain rate [1/s] that the training recordings reach, as the model simulates them."""
+        found = None
+        for recordings in self.training:
+            simulator = model.simulator(recordings.dataset.simulator)
+            with torch.no_grad():
+                positions, _ = recordings.in_simulator(simulator).simulate_vertices(
+                    parameters=model.parameters(simulator)
+                )
+            own = StrainRange.of(simulator.mesh, positions, simulator.time_step)
+            found = own if found is None else found.united(own)
+        assert found is not None
+        return found.strain, found.rate
+
+
+def _motions(recordings: Recordings) -> NDArray[np.float64]:
+    """Largest distance of a marker from its first position [m], by recording."""
+    moved = torch.linalg.norm(recordings.markers - recordings.markers[0], dim=-1)
+    both = recordings.valid * recordings.valid[0]
+    largest: NDArray[np.float64] = (moved * both).amax((0, 2)).numpy()
+    return largest
+
+
+def _largest_motion(recordings: Recordings) -> float:
+    return float(_motions(recordings).max())
