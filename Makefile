@@ -29,7 +29,7 @@ demo: install
 	$(BIN)/rafl-calibrate $(DEMO)/calibration --out $(DEMO)/calib.yaml
 	$(BIN)/rafl-track $(DEMO)/videos --calib $(DEMO)/calib.yaml --specimen datasets/specimens/canonical.yaml --out $(DEMO)/tracks
 	$(BIN)/rafl-capture datasets/specimens/canonical.yaml $(DEMO)/tracks --recordings $(DEMO)/recordings.csv --out $(DEMO)/canonical.h5
-	$(BIN)/rafl-fit $(DEMO)/canonical.h5 --out $(DEMO)/run --epochs 16
+	$(BIN)/rafl-fit $(DEMO)/canonical.h5 --out $(DEMO)/run
 	$(BIN)/rafl-eval $(DEMO)/run $(DEMO)/canonical.h5
 
 # Two workers of one thread each: kernels with several threads in each would compete for the cores.

@@ -9,7 +9,7 @@ from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 
-METHODS = ("auto", "constitutive", "rafl", "srl", "sysid", "sysid-e", "sysid-damping", "sysid-loss", "sysid-branches")
+METHODS = ("auto", "rafl", "srl", "sysid", "sysid-e", "sysid-damping", "sysid-loss", "sysid-branches", "constitutive")
 INTEGRATORS = ("implicit-euler", "generalised-alpha")
 DATASET = "a dataset (.h5, written by rafl-capture)"
 
@@ -24,10 +24,10 @@ def fit(
     method: Annotated[
         str,
         typer.Option(
-            help="auto: the simplest of several models that predicts left-out recordings best; constitutive: material "
-            "with a learned strain energy and viscosity; rafl: residual field; srl: supervised baseline; sysid: E and nu, sysid-e: E at nu = 0.499, "
-            "sysid-damping: E, nu and viscosity, sysid-loss: E, nu and loss factor, "
-            "sysid-branches: E, nu and Maxwell branches."
+            help="auto: the simplest of several models that predicts left-out recordings as well as any; "
+            "constitutive: material with a learned strain energy and viscosity; rafl: residual acceleration field; "
+            "srl: supervised baseline; sysid: E and nu, sysid-e: E at nu = 0.499, sysid-damping: E, nu and viscosity, "
+            "sysid-loss: E, nu and loss factor, sysid-branches: E, nu and Maxwell branches."
         ),
     ] = "auto",
     out: Annotated[Path | None, typer.Option(help="Run folder [runs/DATASET-METHOD].")] = None,

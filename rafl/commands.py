@@ -22,6 +22,7 @@ from rafl.data.dataset_file import read_dataset
 from rafl.evaluation.metrics import (
     Comparison,
     Transfer,
+    beyond_training,
     compare_skipping_failures,
     error_table,
     held_out_errors,
@@ -180,6 +181,8 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
     transfer = Transfer.of(splits)
     if transfer.errors.shape[1] > 1:
         write_text(folder / "transfer.csv", transfer.errors.to_csv(float_format="%.6f"))
+    for sentence in beyond_training(comparisons, models):
+        typer.echo(f"warning: {sentence}", err=True)
     for name, count in transfer.negative_transfers.items():
         simulated = transfer.datasets_simulated[name]
         failing = f"; its simulation fails on {failed[name]} more" if name in failed else ""

@@ -250,9 +250,11 @@ def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Pat
     assert_refused(run("rafl-fit", "a.h5", "--out", "odd", "--epochs", "1", "--resume"), "config.yaml", "as YAML")
     assert_refused(run("rafl-eval", "nowhere", "a.h5"), "nowhere/model.pt")
     assert_refused(run("rafl-fit", "a.h5", "--out", "a.h5/run"), "a.h5", "check the path")
-    done = run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1", "--frames", "3")
+    done = run("rafl-fit", "a.h5", "--out", "run", "--method", "rafl", "--epochs", "1", "--frames", "3")
     assert done.returncode == 0, done.stderr
-    assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1"), "already holds a run", "--resume")
+    assert_refused(
+        run("rafl-fit", "a.h5", "--out", "run", "--method", "rafl", "--epochs", "1"), "already holds a run", "--resume"
+    )
     assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--epochs", "2", "--resume"), "the settings")
     (tmp_path / "run" / "model.pt").write_bytes(b"x")
     assert_refused(run("rafl-eval", "run", "a.h5"), "model.pt", "cannot be read")
@@ -261,7 +263,9 @@ def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Pat
 def test_tensorboard_option(built: Dataset, run: Run, tmp_path: Path) -> None:
     """The option writes events, or asks for the package if it is not installed."""
     write_dataset(tmp_path / "a.h5", built)
-    result = run("rafl-fit", "a.h5", "--out", "run", "--epochs", "1", "--frames", "3", "--tensorboard")
+    result = run(
+        "rafl-fit", "a.h5", "--out", "run", "--method", "rafl", "--epochs", "1", "--frames", "3", "--tensorboard"
+    )
     if importlib.util.find_spec("tensorboard") is None:
         assert_refused(result, "package tensorboard", "history.csv")
         assert not (tmp_path / "run").exists()
@@ -347,5 +351,7 @@ def test_fit_refuses_unsuitable_datasets_before_it_writes(built: Dataset, run: R
         run("rafl-fit", "a.h5", "c.h5", "--out", "run"), "same time integration", "c: implicit-euler, 2 substeps"
     )
     assert_refused(run("rafl-fit", "a.h5", "--method", "magic", "--out", "run"), "--method", "sysid-e", "magic")
-    assert_refused(run("rafl-fit", "a.h5", "--from", "nowhere", "--out", "run"), "nowhere", "check the path")
+    assert_refused(
+        run("rafl-fit", "a.h5", "--method", "rafl", "--from", "nowhere", "--out", "run"), "nowhere", "check the path"
+    )
     assert not (tmp_path / "run").exists()

@@ -44,7 +44,9 @@ def test_rendered_videos_to_fitted_model(specimen_file: Path, run: Run, tmp_path
     )
     text = output("rafl-capture", specimen_file, "tracks", "--recordings", "recordings.csv", "--out", "small.h5")
     assert "next: rafl-fit small.h5" in text
-    text = output("rafl-fit", "small.h5", "--out", "run", "--epochs", "10", "--learning-rate", "0.002")
+    text = output(
+        "rafl-fit", "small.h5", "--out", "run", "--method", "rafl", "--epochs", "10", "--learning-rate", "0.002"
+    )
     assert "next: rafl-eval run small.h5" in text
     text = output("rafl-fit", "small.h5", "--out", "sysid", "--method", "sysid", "--epochs", "4", "--frames", "10")
     assert "identified E" in text

@@ -8,6 +8,7 @@ from torch import Tensor
 from rafl.fem.mesh import HexMesh
 from rafl.fem.strain import MULTIPLICITY, green_strain
 
+MARGIN = 0.1  # by which a range must be left before it counts; recordings of one shape scatter by as much
 QUANTILE = 0.99  # over cells and frames: single cells beside the clamp do not count
 
 
@@ -33,6 +34,10 @@ class StrainRange:
         rate = np.diff(strain, axis=0) / time_step
         size, speed = (np.sqrt((x**2 * MULTIPLICITY).sum(-1)) for x in (strain, rate))
         return cls(float(np.quantile(size, QUANTILE)), float(np.quantile(speed, QUANTILE)))
+
+    def exceeds(self, other: "StrainRange") -> bool:
+        """Whether strain or rate are larger than those of another range by more than `MARGIN`."""
+        return self.strain > (1.0 + MARGIN) * other.strain or self.rate > (1.0 + MARGIN) * other.rate
 
     def united(self, other: "StrainRange") -> "StrainRange":
         """The range that covers both."""

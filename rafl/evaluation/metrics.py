@@ -1,6 +1,7 @@
 """Marker errors of the baseline simulator and of fitted models on recordings, as the paper defines them."""
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import pandas as pd
@@ -10,6 +11,7 @@ from numpy.typing import NDArray
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import SPLITS, Dataset
 from rafl.data.objective import Recordings, frame_errors
+from rafl.data.strain_range import StrainRange
 from rafl.evaluation.oscillation import fit_oscillation, most_active_coordinate, rest_position_error
 from rafl.fem.mesh import HexMesh
 from rafl.fitting.run_folder import FittedModel
@@ -32,6 +34,7 @@ class Comparison:
         mesh: of the specimen.
         shapes: by method, vertices in the first and last frame [m], (2, N, 3).
         mean_force: by method that has a residual force, its mean magnitude at every vertex [N], (N).
+        strains: by method, strain and strain rate [1/s] that the body reaches, see `rafl.data.strain_range`.
     """
 
     dataset: str
@@ -46,6 +49,7 @@ class Comparison:
     mesh: HexMesh
     shapes: dict[str, NDArray[np.float64]]
     mean_force: dict[str, NDArray[np.float64]]
+    strains: dict[str, StrainRange]
 
 
 def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison]:
@@ -57,7 +61,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
     """
     names = list(dataset.trajectories)
     recordings = Recordings.of(dataset, names)
-    simulated, errors, shapes, magnitudes = {}, {}, {}, {}
+    simulated, errors, shapes, magnitudes, strains = {}, {}, {}, {}, {}
     with torch.no_grad():
         for method, model in {BASELINE: FittedModel(BASELINE), **models}.items():
             simulator = model.simulator(dataset.simulator)
@@ -66,6 +70,9 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
             markers = dataset.markers.positions(q)
             simulated[method] = markers.numpy()
             shapes[method] = q.numpy()
+            strains[method] = [
+                StrainRange.of(simulator.mesh, q[:, b : b + 1], simulator.time_step) for b in range(len(names))
+            ]
             if force.numel():
                 magnitudes[method] = torch.linalg.norm(force, dim=-1).numpy()
             errors[method] = frame_errors(recordings, markers)
@@ -87,6 +94,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
                 dataset.simulator.mesh,
                 {method: q[[0, len(item.time) - 1], b] for method, q in shapes.items()},
                 {method: values[: len(item.time) - 1, b].mean(0) for method, values in magnitudes.items()},
+                {method: values[b] for method, values in strains.items()},
             )
         )
     return result
@@ -114,6 +122,24 @@ def compare_skipping_failures(
             except SimulationError as error:
                 failures[name] = error
     return compare(dataset, {name: models[name] for name in models if name not in failures}), failures
+
+
+def beyond_training(comparisons: list[Comparison], models: dict[str, FittedModel]) -> list[str]:
+    """One sentence for every model and dataset with motions beyond the strain or the rate of the model's training."""
+    sentences = []
+    for name, model in models.items():
+        for dataset in dict.fromkeys(item.dataset for item in comparisons):
+            own = [item.strains[name] for item in comparisons if item.dataset == dataset and name in item.strains]
+            if model.seen is None or not own:
+                continue
+            seen = StrainRange(*model.seen)
+            found = reduce(StrainRange.united, own)
+            if found.exceeds(seen):
+                sentences.append(
+                    f"{dataset}: strains up to {100 * found.strain:.2g} % and {found.rate:.2g} 1/s, where the training "
+                    f"of {name} reached {100 * seen.strain:.2g} % and {seen.rate:.2g} 1/s: its errors there may grow"
+                )
+    return sentences
 
 
 def error_table(comparisons: list[Comparison]) -> pd.DataFrame:

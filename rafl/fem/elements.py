@@ -30,7 +30,7 @@ from rafl.fem.kernel_layout import (
     V,
 )
 from rafl.fem.laws.kernel import fill_derivatives
-from rafl.fem.learned_energy import add_learned_energy
+from rafl.fem.learned_energy_kernel import add_learned_energy
 from rafl.fem.simd import KERNEL_OPTIONS, lane_products, transposed_product, weighted_rows
 from rafl.fem.svd import signed_svd_simd
 

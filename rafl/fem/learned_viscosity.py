@@ -4,9 +4,9 @@ The second Piola-Kirchhoff stress is 2 eta dE/dt, with the Green strain E and
 
     eta = mu sum_k w_k psi_k,    psi_k = 1 / sqrt(rate_k^2 + |dE/dt|^2)    or    TIME |E| / sqrt(strain_k^2 + |E|^2).
 
-The first kind is friction: far above rate_k its stress 2 mu w_k no longer grows with the rate. The second acts where the
-body is strained. With weights w_k >= 0 the power 2 eta |dE/dt|^2 that is dissipated is never negative. Over a step, eta is
-that of the strain and the rate at its start, so the power stays non-negative whatever the step.
+The first kind is friction: far above rate_k its stress 2 mu w_k no longer grows with the rate. The second acts where
+the body is strained. With weights w_k >= 0 the power 2 eta |dE/dt|^2 that is dissipated is never negative. Over a step,
+eta is that of the strain and the rate at its start, so the power stays non-negative whatever the step.
 """
 
 from torch import Tensor

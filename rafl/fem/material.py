@@ -58,8 +58,8 @@ class Material:
         viscosity: Kelvin-Voigt coefficient eta [Pa s]; second Piola-Kirchhoff stress 2 eta dE/dt.
         branch_shares, branch_times: of the Maxwell branches: shear modulus relative to mu at rest, and relaxation time
             [s]; see `rafl.simulation.viscous_memory`. E is the relaxed modulus.
-        energy_weights: of a learned strain energy, see `rafl.fem.learned_energy`, relative to the law's mu / 2. E and
-            nu stay those of small strains: the law takes what the learned energy leaves of mu. Empty for none.
+        energy_weights: of a learned strain energy, see `rafl.fem.learned_energy`, relative to mu / 2. E and nu stay
+            those of small strains: the law takes what the learned energy leaves of mu. Empty for none.
         dissipation_weights: of a learned viscosity, see `rafl.fem.learned_viscosity`, relative to mu. Empty for none.
 
     Raises:

@@ -16,7 +16,7 @@ from rafl.data.strain_range import StrainRange
 from rafl.fitting.material_search import GOOD, Array, History, MaterialSearch, Minimum
 from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, MODULUS, POISSON, material_values
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
-from rafl.fitting.sysid import add_constitutive_residual, extended
+from rafl.fitting.sysid import add_constitutive_residual
 from rafl.fitting.train_field import Report, training_items
 from rafl.simulation.rollout import rollout
 
@@ -45,8 +45,8 @@ class Candidate:
 def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
     """Identify the material, fit a constitutive residual on top, and keep the simplest model that predicts as well.
 
-    The candidates are the assumed material; E, nu and a loss factor; E, nu, viscosity and Maxwell branches; and these
-    with a learned strain energy and viscosity. Each is judged by its error on the validation recordings and on every
+    The candidates are the assumed material; E, nu and Maxwell branches; and these with a learned strain energy and
+    viscosity. Each is judged by its error on the validation recordings and on every
     training recording as predicted from the others; with several datasets, on every dataset as predicted from the
     others. A candidate is kept if no later one has a smaller error by more than the standard error of the difference,
     and if a free run of some seconds does not gain energy.
@@ -69,19 +69,16 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
             candidates.append(Candidate(name, fitted, judge.errors(fitted, search, minimum)))
             write_text(run / f"parameters-{name}.csv", search.parameter_table(minimum))
 
-    loss = MaterialSearch(
-        datasets, settings, METHOD_QUANTITIES["sysid-loss"], history, run / "checkpoint-sysid-loss.pt"
-    )
-    minimum = loss.solve(GOOD)
-    consider("sysid-loss", loss, minimum)
+    loss = MaterialSearch(datasets, settings, METHOD_QUANTITIES["sysid-loss"], history, run / "checkpoint-start.pt")
+    start = _with_branches(loss.identified(loss.solve_leading_frames()))
     branches = MaterialSearch(
         datasets, settings, METHOD_QUANTITIES["sysid-branches"], history, run / "checkpoint-sysid-branches.pt"
     )
     branches.use_frames(1.0)
-    minimum = branches.descend(_with_branches(loss.identified(minimum.x)), settings.epochs, GOOD)
+    minimum = branches.descend(start, settings.epochs, GOOD)
     consider("sysid-branches", branches, minimum)
     learned = add_constitutive_residual(branches, minimum, datasets, run / "checkpoint-constitutive.pt")
-    minimum = learned.descend(extended(minimum.x, learned), settings.epochs, GOOD)
+    minimum = learned.descend(learned.prior_at, settings.epochs, GOOD)
     consider("constitutive", learned, minimum)
 
     chosen = choose(candidates, judge.groups)
@@ -95,7 +92,7 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
 
 
 def _with_branches(identified: dict[str, float]) -> Array:
-    """Variables of `sysid-branches` for the same material as that of `sysid-loss`."""
+    """Variables of `sysid-branches` for the same material as that of variables of `sysid-loss`."""
     shares = material_values({LOSS_FACTOR.name: identified[LOSS_FACTOR.name]})["branch_shares"]
     values = [identified[MODULUS.name], identified[POISSON.name], *shares.tolist()]
     quantities = METHOD_QUANTITIES["sysid-branches"]

@@ -55,7 +55,7 @@ CURVATURE_RECORDINGS, CURVATURE_SIMULATIONS = 3, 24
 MIN_RELATIVE_CURVATURE = 1e-12  # of the Gauss-Newton matrix; directions of less are taken as undetermined
 # Gain of a step relative to the expected one between which the matrix is kept: it changes slowly.
 GOOD_MODEL = (0.5, 1.5)
-MIN_DAMPING = 0.1  # of Levenberg and Marquardt, relative to the matrix, after a step that fails
+MIN_STEP = 0.05  # fraction of a step below which the search ends
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,9 @@ class MaterialSearch:
         quantities: to search for.
         history: of the run.
         checkpoint: file of earlier evaluations, which are not repeated.
-        prior_weight: second derivative of the loss by each learned quantity's variable that the prior adds.
+        prior_weight: what the prior adds to the loss where one variable lies `Quantity.spread` from its prior value,
+            times 2; 0 for no prior.
+        prior_at: prior values of the variables, (n).
     """
 
     def __init__(
@@ -134,12 +136,14 @@ class MaterialSearch:
         history: History,
         checkpoint: Path,
         prior_weight: float = 0.0,
+        prior_at: Array | None = None,
     ) -> None:
         used = prepare_datasets(datasets, settings)
         self.training = batches_by_dataset(training_items(used), settings.by_sigma)
         self.validation = validation_batches(used)
         self.quantities, self.settings, self.history = quantities, settings, history
         self.prior_weight = prior_weight
+        self.prior_at = np.zeros(len(quantities)) if prior_at is None else prior_at
         self.simulator = used[0].simulator
         self.frames = 0  # number of frames to simulate
         self.evaluations: dict[tuple[float, ...], Evaluation] = {}  # by frames and variables
@@ -163,13 +167,18 @@ class MaterialSearch:
 
     def solve(self, tolerance: float = EXACT) -> Minimum:
         """The best minimum, from several starting points: first by the leading frames, finally by all."""
+        start = self.solve_leading_frames()
+        self.use_frames(1.0)
+        return self.descend(start, self.settings.epochs, tolerance)
+
+    def solve_leading_frames(self) -> Array:
+        """The best variables for the leading frames, from several starting points."""
         points = self.starting_points()
         for fraction in FRAME_FRACTIONS:
             self.use_frames(fraction)
             results = (self.descend(point, EVALUATIONS_PER_STAGE, EARLY) for point in points)
             points = [min(results, key=lambda result: result.loss).x]
-        self.use_frames(1.0)
-        return self.descend(points[0], self.settings.epochs, tolerance)
+        return points[0]
 
     def starting_points(self) -> list[Array]:
         """Variables to start from; those of the assumed material come first."""
@@ -218,8 +227,8 @@ class MaterialSearch:
     def _save(self) -> None:
         known = [[list(key), *vars(value).values()] for key, value in self.evaluations.items()]
         curvatures = [[list(key), value.tolist()] for key, value in self.curvatures.items()]
-        content = {"format": FORMAT, "method": self.settings.method, "known": known, "curvatures": curvatures}
-        save_tensors(self.checkpoint, content)
+        content: dict[str, object] = {"format": FORMAT, "method": self.settings.method}
+        save_tensors(self.checkpoint, content | {"known": known, "curvatures": curvatures})
 
     def _simulate(self, x: Array) -> Evaluation:
         losses: list[float] = []
@@ -235,13 +244,14 @@ class MaterialSearch:
         return Evaluation(losses, gradients, self.prior(x))
 
     def prior(self, x: Array) -> tuple[float, list[float]]:
-        """Loss and gradient (n) of the prior: half the sum of `prior_curvature` times the squared variables."""
-        return 0.5 * float(self.prior_curvature @ x**2), (self.prior_curvature * x).tolist()
+        """Loss and gradient (n) of the prior: half the sum of `prior_curvature` times the squares of x - x_prior."""
+        apart = x - self.prior_at
+        return 0.5 * float(self.prior_curvature @ apart**2), (self.prior_curvature * apart).tolist()
 
     @property
     def prior_curvature(self) -> Array:
-        """Second derivatives of the prior by each variable, (n): the same for all learned quantities, else zero."""
-        return self.prior_weight * np.array([float(quantity.learned) for quantity in self.quantities])
+        """Second derivatives of the prior by each variable, (n)."""
+        return self.prior_weight / np.array([quantity.spread for quantity in self.quantities]) ** 2
 
     def curvature(self, x: Array) -> Array:
         """Gauss-Newton matrix of the recordings' mean loss at x, (n, n), by differences, from a few recordings."""
@@ -256,8 +266,13 @@ class MaterialSearch:
         return self.curvatures[key]
 
     def _gauss_newton_matrix(self, x: Array, recordings: Recordings, count: int) -> Array:
-        """Mean over `count` recordings of the Gauss-Newton matrix (n, n); all differences are simulated as one batch."""
-        few = recordings.select(_spread_by_motion(recordings, count))
+        """Mean Gauss-Newton matrix (n, n), from `count` recordings; all differences are simulated as one batch.
+
+        The others are taken to have the same matrix, in proportion to their mean squared motion.
+        """
+        motion = _square_motion(recordings)
+        chosen = _spread_by_size(motion, count)
+        few = recordings.select(chosen)
         sets = x + DIFFERENCE_STEP * np.vstack([np.zeros(len(x)), np.eye(len(x))])
         batch = len(few.names)
         variables = torch.from_numpy(sets.T).repeat_interleave(batch, dim=1)  # every set with every recording
@@ -267,41 +282,39 @@ class MaterialSearch:
             positions, _ = rollout(few.dataset.simulator, start, len(few.markers) - 1, parameters=parameters)
             markers = few.dataset.markers.positions(positions)
         markers = markers.reshape(len(markers), len(sets), batch, *markers.shape[2:])
-        matrix: Array = loss_curvature(few, (markers[:, 1:] - markers[:, :1]) / DIFFERENCE_STEP).numpy()
-        return matrix
+        own: Array = loss_curvature(few, (markers[:, 1:] - markers[:, :1]) / DIFFERENCE_STEP).numpy()
+        return own * float(motion.mean() / motion[chosen].mean()) if motion[chosen].mean() > 0.0 else own
 
     def descend(self, start: Array, evaluations: int, tolerance: float = EXACT) -> Minimum:
-        """Minimise within bounds from a starting point by the Levenberg-Marquardt method.
+        """Minimise within bounds from a starting point by the Gauss-Newton method.
 
-        Every step minimises a quadratic model of the loss with the exact gradient and a Gauss-Newton matrix. The matrix
-        is computed again if the model foretold a step's gain badly. The search ends where the model expects to gain
-        less than `tolerance` times the loss, or after a number of evaluations.
+        Every step minimises a quadratic model of the loss with the exact gradient and a Gauss-Newton matrix. A step
+        that does not lower the loss is halved. The matrix is computed again where the model foretold a gain badly. The
+        search ends where the model expects to gain less than `tolerance` times the loss, or after some evaluations.
         """
         if not self.history.rows:
             self.record(start)
         lows, highs = self.bounds
         x, found, matrix = start, self.evaluate(start), self.curvature(start)
-        at, damping = start, 0.0  # where the matrix was computed; relative to the matrix
+        at, length = start, 1.0  # where the matrix was computed; the fraction of a step to try
         for _ in range(evaluations):
             model = matrix + np.diag(self.prior_curvature)
-            scale = np.maximum(np.diag(model), MIN_RELATIVE_CURVATURE * max(model.max(), MIN_LOSS))
-            step = _bounded_step(model + np.diag(damping * scale), found.gradient, lows - x, highs - x)
-            expected = -(found.gradient @ step + 0.5 * step @ model @ step)
-            converged = not expected > tolerance * found.loss
-            # A model of another point may expect more than there is, or the wrong minimum.
-            if (converged or expected > found.loss) and (at != x).any() and tolerance < EARLY:
-                matrix, at, damping = self.curvature(x), x, 0.0
+            step = _bounded_step(model, found.gradient, lows - x, highs - x)
+            converged = not -(found.gradient @ step + 0.5 * step @ model @ step) > tolerance * found.loss
+            if (converged or length < MIN_STEP) and (at != x).any() and tolerance < EARLY:
+                matrix, at, length = self.curvature(x), x, 1.0
                 continue
-            if converged:
+            if converged or length < MIN_STEP:
                 break
+            step *= length
+            expected = -(found.gradient @ step + 0.5 * step @ model @ step)
             trial = self.evaluate(np.clip(x + step, lows, highs))
             gained = (found.loss - trial.loss) / expected
             if gained > 0.0:
-                x, found = np.clip(x + step, lows, highs), trial
+                x, found, length = np.clip(x + step, lows, highs), trial, min(2.0 * length, 1.0)
                 self.record(x)
-                damping = damping / 4.0 if gained > GOOD_MODEL[0] else max(damping, MIN_DAMPING)
             else:
-                damping = max(4.0 * damping, MIN_DAMPING)
+                length *= 0.5
             if not GOOD_MODEL[0] <= gained <= GOOD_MODEL[1] and (at != x).any():
                 matrix, at = self.curvature(x), x
         return Minimum(x, found.loss, matrix)
@@ -407,10 +420,16 @@ def _bounded_step(matrix: Array, gradient: Array, low: Array, high: Array) -> Ar
     return step
 
 
-def _spread_by_motion(recordings: Recordings, count: int) -> list[int]:
-    """Indices of `count` recordings at even ranks of the largest motion of a marker, the extremes included."""
-    moved = torch.linalg.norm(recordings.markers - recordings.markers[0], dim=-1) * recordings.valid
-    moved = (moved * recordings.valid[0]).amax((0, 2))
-    order = torch.argsort(moved).tolist()
-    ranks = np.unique(np.round(np.linspace(len(order) - 1, 0, min(count, len(order)))).astype(int))
-    return sorted(order[rank] for rank in ranks)
+def _square_motion(recordings: Recordings) -> Array:
+    """Mean squared distance of the markers from their first positions [m^2], by recording."""
+    seen = recordings.valid * recordings.valid[0]
+    square = (recordings.markers - recordings.markers[0]).square().sum(-1) * seen
+    mean: Array = (square.sum((0, 2)) / seen.sum((0, 2)).clamp_min(1.0)).numpy()
+    return mean
+
+
+def _spread_by_size(sizes: Array, count: int) -> list[int]:
+    """Indices of `count` values at even ranks, the largest included, and the smallest too if there are two or more."""
+    order = np.argsort(sizes)
+    ranks = np.round(np.linspace(len(order) - 1, 0, min(count, len(order)))).astype(int)
+    return sorted(order[np.unique(ranks)].tolist())

@@ -23,7 +23,7 @@ METHODS: dict[str, FitFunction] = {
     "constitutive": fit_constitutive,
 }
 # Default maximum number of passes over the recordings (iterations of sysid).
-DEFAULT_EPOCHS = {"auto": 40, "rafl": 30, "srl": 1000, **dict.fromkeys(METHOD_QUANTITIES, 40)}
+DEFAULT_EPOCHS = {"rafl": 30, "srl": 1000, **dict.fromkeys(METHOD_QUANTITIES, 40), "constitutive": 12, "auto": 12}
 
 
 def check_inputs(method: str, datasets: list[Dataset], start: Path | None, integrator: str) -> None:
@@ -44,7 +44,7 @@ def check_inputs(method: str, datasets: list[Dataset], start: Path | None, integ
     if integrator and integrator not in INTEGRATORS:
         raise InputError(f"--integrator: expected {' or '.join(INTEGRATORS)}, found {integrator!r}")
     if start is not None and method != "rafl":
-        raise InputError(f"--from: expected method rafl, found {method}; leave it out")
+        raise InputError(f"--from: expected method rafl, found {method}; add --method rafl, or leave it out")
     before = FittedModel(method) if start is None else load_start_model(start)
     _check_time_integration(datasets, before, integrator)
     training_items(datasets)

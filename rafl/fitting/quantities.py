@@ -26,8 +26,8 @@ class Quantity:
         unit: for messages.
         scale: in the unit of the value.
         start: value to start from if the assumed material has none, or less.
-        learned: whether the quantity is a weight of the constitutive residual. Its prior is a half-normal distribution
-            with a standard deviation of one unit of the variable.
+        spread: standard deviation of the variable's prior, where a search has one.
+        learned: whether the quantity is a weight of the constitutive residual.
     """
 
     name: str
@@ -37,6 +37,7 @@ class Quantity:
     unit: str
     scale: float = 1.0
     start: float = 0.0
+    spread: float = 1.0
     learned: bool = False
 
     def variable(self, value: float) -> float:
@@ -58,7 +59,7 @@ class Quantity:
         return min(a, b), max(a, b)
 
 
-MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa")
+MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa", spread=0.05)
 POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "gap", "", scale=0.05)
 VISCOSITY = Quantity("viscosity", 0.0, 1e4, "linear", "Pa s", scale=100.0, start=100.0)
 LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "linear", "", scale=0.1, start=0.1)
@@ -70,7 +71,8 @@ SHARES = tuple(
 )
 # Weights that change the stress by as much as the law has, or the loss factor by some hundredths, are unusual.
 ENERGY_WEIGHTS = tuple(
-    Quantity(f"energy_weight_{k + 1}", 0.0, 20.0, "linear", "", learned=True) for k in range(ENERGY_UNITS)
+    Quantity(f"energy_weight_{k + 1}", 0.0, 1.0 if k % 2 == 0 else 20.0, "linear", "", learned=True)
+    for k in range(ENERGY_UNITS)
 )
 DISSIPATION_WEIGHTS = tuple(
     Quantity(f"dissipation_weight_{k + 1}", 0.0, 1.0, "linear", "", scale=0.01, learned=True)

@@ -8,15 +8,16 @@ import pandas as pd
 
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.fitting.material_search import Array, History, MaterialSearch, Minimum
+from rafl.fitting.material_search import History, MaterialSearch, Minimum
 from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
 from rafl.fitting.train_field import Report
 
 MIN_REPORTED_CORRELATION = 0.9
 MATERIAL_BELOW = "sysid-branches"  # the material that a constitutive residual begins from
-# The prior of a constitutive residual counts as much as this many observations with the errors of the material below.
-PRIOR_OBSERVATIONS = 1.0
+# The errors of a material are systematic: those of a whole fit tell as much as this many independent ones. So a learned
+# weight of one unit must lower the loss that the material leaves by a tenth to be worth it.
+INDEPENDENT_ERRORS = 10.0
 
 
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
@@ -54,23 +55,22 @@ def fit_constitutive(datasets: list[Dataset], settings: Settings, run: Path, rep
     )
     minimum = below.solve()
     search = add_constitutive_residual(below, minimum, datasets, run / "checkpoint.pt")
-    return _save(search, search.descend(extended(minimum.x, search), settings.epochs), run)
+    return _save(search, search.descend(search.prior_at, settings.epochs), run)
 
 
 def add_constitutive_residual(
     below: MaterialSearch, minimum: Minimum, datasets: list[Dataset], checkpoint: Path
 ) -> MaterialSearch:
-    """A search for a constitutive residual too, after a search for the material that ended at a minimum."""
-    weight = PRIOR_OBSERVATIONS * 2.0 * minimum.loss / below.observed
+    """A search for a constitutive residual too, after a search for the material that ended at a minimum.
+
+    It should start at its prior: the material found, and no residual.
+    """
+    weight = 2.0 * minimum.loss / INDEPENDENT_ERRORS
     quantities = METHOD_QUANTITIES["constitutive"]
-    search = MaterialSearch(datasets, below.settings, quantities, below.history, checkpoint, weight)
+    at = np.concatenate([minimum.x, np.zeros(len(quantities) - len(minimum.x))])
+    search = MaterialSearch(datasets, below.settings, quantities, below.history, checkpoint, weight, at)
     search.use_frames(1.0)
     return search
-
-
-def extended(x: Array, search: MaterialSearch) -> Array:
-    """Variables of a search that begins where one for its first quantities ended, at x; the others start at zero."""
-    return np.concatenate([x, np.zeros(len(search.quantities) - len(x))])
 
 
 def _save(search: MaterialSearch, minimum: Minimum, run: Path) -> FittedModel:

@@ -43,9 +43,9 @@ class ImplicitSolve(torch.autograd.Function):
     """Positions x (B, N, 3) with inertia (x - target) + internal force(x) = force on the free nodes.
 
     Inputs: target (B, N, 3) [m], inertia (B, N) [kg/s^2], force (B, N, 3) [N], positions of the fixed nodes (B, F, 3)
-    [m], moduli (B, 4), the weights of the learned energy (B, K) [Pa], the stiffness of the hourglass modes (3, B, U, 12,
-    12) for `enhanced` integration, the modulus (B, E, P) [Pa] and the memory (B, E, Z) of the viscous stress, and the
-    velocity offset (B, N, 3) of stiffness damping; each after the moduli may be None.
+    [m], moduli (B, 4), the weights of the learned energy (B, K) [Pa], the stiffness of the hourglass modes
+    (3, B, U, 12, 12) for `enhanced` integration, the modulus (B, E, P) [Pa] and the memory (B, E, Z) of the viscous
+    stress, and the velocity offset (B, N, 3) of stiffness damping; each after the moduli may be None.
 
     At the solution (inertia + K) dx = inertia dtarget + dforce - ..., with K the exact tangent. So one adjoint solve
     gives all derivatives.
@@ -87,7 +87,8 @@ class ImplicitSolve(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         """Derivatives with respect to each input."""
-        x, target, inertia, moduli, *history = ctx.saved_tensors
+        x, target, inertia, moduli, energy, hourglass, viscous_modulus, memory, velocity_offset = ctx.saved_tensors
+        history = (energy, hourglass, viscous_modulus, memory, velocity_offset)
         simulator, engine = ctx.context.simulator, ctx.context.simulator.engine
         state = _constitutive_state(moduli, *history, ctx.context)
         q = _array(x)

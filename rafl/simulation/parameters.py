@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from rafl.fem.laws import LAWS
-from rafl.fem.learned_energy import rest_share
+from rafl.fem.learned_energy import shared_weights
 from rafl.fem.material import Material, lame
 
 
@@ -57,21 +57,22 @@ class Parameters:
     def _law_lame(self) -> tuple[Tensor, Tensor]:
         """Parameters mu and lambda of the law [Pa]: mu without what a learned energy has of it at rest."""
         mu, lam = lame(self.youngs_modulus, self.poissons_ratio)
-        return (mu / (1.0 + rest_share(self.energy_weights)) if self.energy_weights.shape[-1] else mu), lam
+        return (mu * shared_weights(self.energy_weights)[1] if self.energy_weights.shape[-1] else mu), lam
 
     def rest_lame(self, law: str, batch: int) -> tuple[Tensor, Tensor]:
         """Lame parameters mu and lambda of the linearisation at rest [Pa], (B) each, learned energy included."""
         own, lam = self._law_lame()
         mu, rest_lam = LAWS[law].rest_lame(own, lam)
         if self.energy_weights.shape[-1]:
-            mu = mu + own * rest_share(self.energy_weights)
+            whole, _ = lame(self.youngs_modulus, self.poissons_ratio)
+            mu = mu + (whole - own)
         return mu.expand(batch), rest_lam.expand(batch)
 
     def energy(self, batch: int) -> Tensor | None:
         """Weights of the learned energy [Pa], (B, K), or None without it."""
         units = self.energy_weights.shape[-1]
-        own, _ = self._law_lame()
-        return 0.5 * own[..., None] * self.energy_weights.expand(batch, units) if units else None
+        mu, _ = lame(self.youngs_modulus, self.poissons_ratio)
+        return (0.5 * mu[..., None] * shared_weights(self.energy_weights)[0]).expand(batch, units) if units else None
 
     def dissipation(self, law: str, batch: int) -> Tensor | None:
         """Weights of the learned viscosity times mu at rest [Pa], (B, K), or None without it."""

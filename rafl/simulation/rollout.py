@@ -97,9 +97,8 @@ class _BodyBatch:
         factors: Factors | None = None,
     ) -> tuple[Tensor, ViscousMemory | None]:
         """Solution of a step's equation, `duration` [s] after the latest one, and the memory after it."""
-        simulator, viscous_terms = self.simulator, (None, None)
-        if memory is not None:
-            viscous_terms = memory.stress_terms(duration)
+        simulator = self.simulator
+        viscous_terms = (None, None) if memory is None else memory.stress_terms(duration)
         offset = problem.velocity_offset if self.parameters.stiffness_damped else None
         context = SolveContext(simulator, problem.guess, problem.velocity_factor, label, factors)
         loads = (problem.target, problem.inertia, force, fixed_positions)

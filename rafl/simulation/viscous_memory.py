@@ -57,7 +57,7 @@ class ViscousMemory:
 
     def _at_points(self, strain: Tensor) -> Tensor:
         """Green strains at the points, (B, E, P, 6)."""
-        return strain[..., : 6 * self.points].unflatten(-1, (self.points, 6))
+        return strain[..., : 6 * self.points].reshape(*strain.shape[:2], self.points, 6)
 
     def _over_strains(self, at_points: Tensor) -> Tensor:
         """Values at the points (B, E, P), repeated for every strain, (B, E, Z)."""

@@ -17,9 +17,10 @@ SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
 FIT_OPTIONS: dict[str, list[object]] = {  # of rafl-fit, by model
     "sysid": ["--method", "sysid", "--epochs", 25],
     "sysid-e": ["--method", "sysid-e", "--epochs", 15],
-    "rafl": ["--epochs", 25],
+    "auto": [],
+    "rafl": ["--method", "rafl", "--epochs", 25],
     "sysid-damping": ["--method", "sysid-damping", "--epochs", 25, "--integrator", "generalised-alpha"],
-    "rafl-from-sysid": ["--epochs", 25],
+    "rafl-from-sysid": ["--method", "rafl", "--epochs", 25],
 }
 START_MODELS = {"rafl-from-sysid": "sysid-damping"}  # the model whose run a fit starts from
 TABLE_COLUMNS = ["original", "original (paper preset)", *FIT_OPTIONS]

@@ -92,7 +92,6 @@ class Model:
 
 
 LAB_MATERIAL = "the lab's material"
-ONE_STEP = {"substeps": 1}
 NEO_HOOKEAN = {"law": "neo-hookean"}
 MODELS = {
     "sysid-damping": Model("sysid-damping"),
@@ -101,8 +100,8 @@ MODELS = {
     LAB_MATERIAL: Model(""),
     "sysid-branches, neo-Hookean": Model("sysid-branches", NEO_HOOKEAN),
     f"{LAB_MATERIAL}, neo-Hookean": Model("", NEO_HOOKEAN),
-    "sysid-branches, one step a frame": Model("sysid-branches", simulation=ONE_STEP),
-    f"{LAB_MATERIAL}, one step a frame": Model("", simulation=ONE_STEP),
+    "constitutive": Model("constitutive"),
+    "auto": Model("auto"),
     "sysid-damping, full": Model("sysid-damping", {"integration": "full"}),
     "sysid-damping, selective": Model("sysid-damping", {"integration": "selective"}),
 }

@@ -204,7 +204,7 @@ def fill_tensor(w, hourglass, viscous_modulus, velocity_factor, project):
     """Fill the tangent by column and component from TANGENT and the stiffness of the hourglass modes (3, 144 * 8).
 
     viscous_modulus (8) is zero without viscosity.
-   """
+    """
     for r in range(144):
         for g in range(8):
             w[(MODE_STIFFNESS + r) * 8 + g] = hourglass[0, r * 8 + g] + viscous_modulus[g] * hourglass[1, r * 8 + g]

@@ -20,7 +20,7 @@ from rafl.fem.enhanced.layout import (
 from rafl.fem.enhanced.tangent import fill_block, fill_tensor
 from rafl.fem.kernel_layout import ENERGY, STRESS, WEIGHT
 from rafl.fem.laws.kernel import fill_derivatives
-from rafl.fem.learned_energy import add_learned_energy
+from rafl.fem.learned_energy_kernel import add_learned_energy
 from rafl.fem.simd import KERNEL_OPTIONS
 from rafl.fem.svd import signed_svd_simd
 

@@ -25,7 +25,7 @@ def weights(run: Path) -> torch.Tensor:
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch has no distributed training")
 def test_torchrun_equals_one_process(dataset: Dataset, tmp_path: Path) -> None:
     write_dataset(tmp_path / "a.h5", dataset)
-    fit = ["a.h5", "--epochs", "2", "--frames", "8", "--batch", "2", "--seed", "4"]
+    fit = ["a.h5", "--method", "rafl", "--epochs", "2", "--frames", "8", "--batch", "2", "--seed", "4"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
 
     def run(*command: object) -> None:

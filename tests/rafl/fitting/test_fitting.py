@@ -218,7 +218,9 @@ def test_interrupted_identification_is_resumed(
 
     calls = []
     simulate = MaterialSearch._simulate
-    monkeypatch.setattr(MaterialSearch, "_simulate", lambda self, x: (calls.append((self.frames, *x)), simulate(self, x))[1])
+    monkeypatch.setattr(
+        MaterialSearch, "_simulate", lambda self, x: (calls.append((self.frames, *x)), simulate(self, x))[1]
+    )
     with pytest.raises(KeyboardInterrupt):
         identify_material([dataset], settings, broken, stop)
     identify_material([dataset], settings, broken, ignore)
