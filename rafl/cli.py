@@ -67,6 +67,9 @@ def fit(
     by_sigma: Annotated[
         bool, typer.Option("--by-sigma", help="Weight markers by their uncertainty (rafl, sysid).")
     ] = False,
+    limit_energy: Annotated[
+        bool, typer.Option(help="Limit the energy that the field adds to a motion by that in training (rafl).")
+    ] = True,
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Also write the history for TensorBoard into the run folder.")
     ] = False,
@@ -99,6 +102,7 @@ def fit(
         "start": start,
         "integrator": integrator,
         "by_sigma": by_sigma,
+        "limit_energy": limit_energy,
     }
     commands.fit(datasets, out, method, tensorboard, resume, options)
 

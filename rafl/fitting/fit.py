@@ -34,6 +34,7 @@ def fit(
     start: str | Path | None = None,
     by_sigma: bool = False,
     integrator: str = "",
+    limit_energy: bool = True,
 ) -> FittedModel:
     """Fit a model to the `train` recordings of datasets and keep the one with the least `val` error.
 
@@ -60,6 +61,7 @@ def fit(
         start: run folder to fine-tune, or a `sysid` run whose material the field corrects.
         by_sigma: weight markers by their uncertainty.
         integrator: `implicit-euler` or `generalised-alpha`; that of the datasets if empty.
+        limit_energy: whether the energy that a field adds to a motion is limited by what it added in training.
 
     Raises:
         InputError: a file, the run folder or an option does not suit the method.
@@ -82,6 +84,7 @@ def fit(
         start=str(Path(start).resolve()) if start else "",
         by_sigma=by_sigma,
         integrator=integrator,
+        limit_energy=limit_energy,
     )
     check_inputs(method, loaded, Path(start) if start else None, integrator)
     if rank() == 0:  # of the processes that torchrun started

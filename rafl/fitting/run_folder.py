@@ -15,6 +15,7 @@ from rafl.common.errors import InputError
 from rafl.common.files import atomic_file, require_file, write_text
 from rafl.common.yaml_files import check_format, read_yaml_content
 from rafl.residual.acceleration_field import ResidualField
+from rafl.residual.energy_limit import LimitedForce
 from rafl.residual.global_residual import GlobalResidual
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.rollout import ResidualForce
@@ -23,7 +24,7 @@ from rafl.simulation.time_integration import INTEGRATORS
 
 FORMAT = "rafl-run/1"
 TIME_INTEGRATION_KEY = "stepping"  # in model.pt
-SEEN_KEY = "seen"
+ENERGY_KEY, SEEN_KEY = "energy_fraction", "seen"
 
 
 # A residual model of a user's own: makes the residual force on the mesh of a simulator.
@@ -43,6 +44,8 @@ class FittedModel:
         time_integration: `integrator` and `substeps` of the simulator that the model was fitted in; None for the
             specimen's own.
         own: a residual model that was not fitted by this package. It is not saved.
+        energy_fraction: largest work of the field relative to the energy scale of a motion, see
+            `rafl.residual.energy_limit`; None for no limit.
         seen: strain and strain rate [1/s] that the training recordings reach, see `rafl.data.strain_range`; None if
             they were not determined.
     """
@@ -53,6 +56,7 @@ class FittedModel:
     network: GlobalResidual | None = None
     time_integration: dict[str, Any] | None = None
     own: ResidualModel | None = None
+    energy_fraction: float | None = None
     seen: tuple[float, float] | None = None
 
     def simulator(self, own: Simulator) -> Simulator:
@@ -60,7 +64,7 @@ class FittedModel:
         return own if self.time_integration in (None, own.time_integration) else replace(own, **self.time_integration)
 
     def residual(self, simulator: Simulator) -> ResidualForce | None:
-        """The residual force on a specimen, or None if this model has none.
+        """The residual force on a specimen, for one rollout, or None if this model has none.
 
         Raises:
             InputError: the model is not applicable to this mesh.
@@ -68,7 +72,12 @@ class FittedModel:
         if self.own is not None:
             return self.own(simulator)
         residual = self.field or self.network
-        return residual.on(simulator) if residual is not None else None
+        if residual is None:
+            return None
+        force = residual.on(simulator)
+        if self.energy_fraction is None:
+            return force
+        return LimitedForce(force, simulator, self.parameters(simulator), self.energy_fraction)
 
     def parameters(self, simulator: Simulator) -> Parameters:
         """Parameters to simulate a specimen with: the identified material, or else its own."""
@@ -95,6 +104,7 @@ class Settings:
             material.
         by_sigma: whether to weight markers by their uncertainty.
         integrator: time integration of the simulator; empty for that of `start` or else of the datasets.
+        limit_energy: whether the energy that a field adds is limited, see `rafl.residual.energy_limit`.
     """
 
     method: str
@@ -111,6 +121,7 @@ class Settings:
     start: str = ""
     by_sigma: bool = False
     integrator: str = ""
+    limit_energy: bool = True
 
 
 def write_settings(run: Path, settings: Settings) -> None:
@@ -185,6 +196,8 @@ def save_model(run: Path, model: FittedModel) -> None:
         content["material"] = dict(model.material)
     if model.time_integration is not None:
         content[TIME_INTEGRATION_KEY] = dict(model.time_integration)
+    if model.energy_fraction is not None:
+        content[ENERGY_KEY] = model.energy_fraction
     if model.seen is not None:
         content[SEEN_KEY] = list(model.seen)
     if model.network is not None:
@@ -218,7 +231,8 @@ def load_model(run: str | Path) -> FittedModel:
             field.restore(content["field"])
         strain, rate = map(float, content.get(SEEN_KEY, (0.0, 0.0)))
         seen = (strain, rate) if SEEN_KEY in content else None
-    return FittedModel(content["method"], field, material, network, integration, seen=seen)
+        fraction = float(content[ENERGY_KEY]) if ENERGY_KEY in content else None
+    return FittedModel(content["method"], field, material, network, integration, None, fraction, seen)
 
 
 def _is_time_integration(content: Any) -> bool:

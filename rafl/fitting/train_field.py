@@ -28,6 +28,7 @@ from rafl.fitting.run_folder import (
 )
 from rafl.fitting.warm_start import can_fit_targets, pretrain
 from rafl.residual.acceleration_field import ResidualField
+from rafl.residual.energy_limit import MARGIN, MIN_FRACTION, energy_scale, largest_work
 from rafl.residual.field_force import FieldPoints
 from rafl.simulation.rollout import rollout
 
@@ -244,7 +245,31 @@ class _Training:
             self.history.append(row | ({"failed": failed} if failed else {}))
             self._save(best)
         self.group.wait()
-        return load_model(self.run)
+        model = load_model(self.run)
+        if self.settings.limit_energy and model.energy_fraction is None:
+            model = replace(model, energy_fraction=self._energy_fraction(model))
+            if self.group.is_main:
+                save_model(self.run, model)
+        self.group.wait()
+        return model
+
+    def _energy_fraction(self, model: FittedModel) -> float:
+        """Limit of the field's work on other motions, from that on the training and validation recordings."""
+        largest = MIN_FRACTION
+        for recordings in [*batches_by_dataset(self.items), *self.validation]:
+            simulator = model.simulator(recordings.dataset.simulator)
+            parameters, start = model.parameters(simulator), recordings.dataset.start(recordings.names)
+            external = start.force + torch.from_numpy(simulator.weight)
+            try:
+                with torch.no_grad():
+                    scale = energy_scale(simulator, parameters, start.q, start.v, external)
+                    work = largest_work(
+                        *recordings.in_simulator(simulator).simulate_vertices(model.residual(simulator), parameters)
+                    )
+            except SimulationError:
+                continue
+            largest = max(largest, float((work / scale).max()))
+        return MARGIN * largest
 
     def _has_stalled(self) -> bool:
         return has_stalled([row["validation_mm"] for row in self.history], self.settings.patience)

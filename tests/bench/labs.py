@@ -100,7 +100,6 @@ MODELS = {
     LAB_MATERIAL: Model(""),
     "sysid-branches, neo-Hookean": Model("sysid-branches", NEO_HOOKEAN),
     f"{LAB_MATERIAL}, neo-Hookean": Model("", NEO_HOOKEAN),
-    "constitutive": Model("constitutive"),
     "auto": Model("auto"),
     "sysid-damping, full": Model("sysid-damping", {"integration": "full"}),
     "sysid-damping, selective": Model("sysid-damping", {"integration": "selective"}),

@@ -44,6 +44,7 @@ SPECIMENS = EXPERIMENTS.parent / "specimens"
 LARGE_MESH_VERTICES = 1000
 LARGE_MESH_FRAMES, LARGE_MESH_LEARNING_RATE = 50, 4e-3
 FINE_TUNING_PRETRAINING_PASSES = 10
+CONSTITUTIVE_EVALUATIONS = 12  # at most, of the material and of its residual each
 BEAMS = ("canonical", "longer", "shorter", "thicker", "thinner")
 COLUMNS = ["shape", "method", "mean_mm", "std_mm", "paper_mean_mm", "paper_std_mm"]
 
@@ -149,7 +150,8 @@ class Study:
         """A model; fitted if its run is missing. The run folder's file `seconds` holds the duration."""
         folder = self.runs / run
         if not (folder / "seconds").exists():
-            defaults = Settings(method, tuple(item.name for item in datasets), 0, 2e-3, 1e-5, 0, 0, self.seed)
+            names = tuple(item.name for item in datasets)
+            defaults = Settings(method, names, 0, 2e-3, 1e-5, 0, 0, self.seed, limit_energy=False)  # as in the paper
             settings = replace(defaults, **changes, patience=changes["epochs"])
             write_settings(folder, settings)
             start = time.perf_counter()
@@ -201,6 +203,10 @@ class Study:
             same = len(mesh.vertices) == len(self.meshes[trained].vertices)
             rows += self.errors(shape, {"rafl": rafl, "srl": srl} if same else {"rafl": rafl})
         rows += self.errors(trained, {"rafl": rafl, "srl": srl}, least_force=True)
+        constitutive = self.fit("constitutive", "constitutive", own, epochs=CONSTITUTIVE_EVALUATIONS)
+        for shape in self.meshes:
+            found = self.errors(shape, {"constitutive": constitutive})
+            rows += [row for row in found if row["method"] == "constitutive"]
         return pd.DataFrame(rows, columns=COLUMNS)
 
     def fine_tuning_table(self) -> pd.DataFrame:

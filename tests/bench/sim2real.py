@@ -60,7 +60,7 @@ MODELS = {
     "sysid-e": ModelFit("sysid-e"),
     "srl": ModelFit("srl"),
     # As in the paper: without pre-training, with implicit Euler.
-    "rafl": ModelFit("rafl", ("--warm-start", 0)),
+    "rafl": ModelFit("rafl", ("--warm-start", 0, "--no-limit-energy")),
     # With time integration that hardly damps, so that the material's damping is observable.
     "sysid-damping": ModelFit("sysid-damping", ("--integrator", "generalised-alpha")),
     "rafl-from-sysid": ModelFit("rafl", start="sysid-damping"),
