@@ -13,8 +13,8 @@ from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors
 from rafl.data.strain_range import StrainRange
-from rafl.fitting.material_search import GOOD, Array, History, MaterialSearch, Minimum
-from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, MODULUS, POISSON, material_values
+from rafl.fitting.material_search import GOOD, Array, History, MaterialSearch, Minimum, Prior
+from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, MODULUS, POISSON, Quantity, material_values
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
 from rafl.fitting.sysid import add_constitutive_residual
 from rafl.fitting.train_field import Report, training_items
@@ -71,14 +71,14 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
 
     loss = MaterialSearch(datasets, settings, METHOD_QUANTITIES["sysid-loss"], history, run / "checkpoint-start.pt")
     start = _with_branches(loss.identified(loss.solve_leading_frames()))
-    branches = MaterialSearch(
-        datasets, settings, METHOD_QUANTITIES["sysid-branches"], history, run / "checkpoint-sysid-branches.pt"
-    )
+    quantities = METHOD_QUANTITIES["sysid-branches"]
+    prior = Prior(_assumed(quantities, loss), np.array([quantity.deviation for quantity in quantities]))
+    branches = MaterialSearch(datasets, settings, quantities, history, run / "checkpoint-sysid-branches.pt", prior)
     branches.use_frames(1.0)
     minimum = branches.descend(start, settings.epochs, GOOD)
     consider("sysid-branches", branches, minimum)
     learned = add_constitutive_residual(branches, minimum, datasets, run / "checkpoint-constitutive.pt")
-    minimum = learned.descend(learned.prior_at, settings.epochs, GOOD)
+    minimum = learned.descend(learned.prior.mean, settings.epochs, GOOD)
     consider("constitutive", learned, minimum)
 
     chosen = choose(candidates, judge.groups)
@@ -89,6 +89,12 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
     if parameters.exists():
         write_text(run / "parameters.csv", parameters.read_text())
     return kept
+
+
+def _assumed(quantities: tuple[Quantity, ...], search: MaterialSearch) -> Array:
+    """Variables of the assumed material; branches that it does not have are zero."""
+    material = search.simulator.material
+    return np.array([np.clip(q.variable(float(getattr(material, q.name, q.low))), *q.bounds) for q in quantities])
 
 
 def _with_branches(identified: dict[str, float]) -> Array:

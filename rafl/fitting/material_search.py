@@ -47,6 +47,7 @@ EVALUATIONS_PER_STAGE = 4
 EXACT, GOOD, EARLY = 1e-3, 1e-2, 0.1
 NORMAL_QUANTILE_95 = 1.959964  # a normal distribution has 95 % within this many sigmas
 FAILURE_LOSS = 1e6  # loss where a simulation fails
+NEGLIGIBLE_LOSS = 1e-14  # of markers within a nanometre
 MIN_LOSS = 1e-30  # smallest divisor, for a loss of zero
 DIFFERENCE_STEP = 1e-4  # of a variable, for the derivatives of the markers in the Gauss-Newton matrix
 # The Gauss-Newton matrix is that of up to so many recordings, from the largest to the least motion, and of so many
@@ -55,6 +56,7 @@ CURVATURE_RECORDINGS, CURVATURE_SIMULATIONS = 3, 24
 MIN_RELATIVE_CURVATURE = 1e-12  # of the Gauss-Newton matrix; directions of less are taken as undetermined
 # Gain of a step relative to the expected one between which the matrix is kept: it changes slowly.
 GOOD_MODEL = (0.5, 1.5)
+INDEPENDENT_ERRORS = 10.0  # see `Prior`
 MIN_STEP = 0.05  # fraction of a step below which the search ends
 
 
@@ -65,23 +67,54 @@ class Evaluation:
     Attributes:
         losses: of every recording, see `rafl.data.objective.recording_losses`, (R).
         gradients: of every recording's loss, exact, (R, n).
-        prior: loss and gradient (n) of the prior.
     """
 
     losses: list[float]
     gradients: list[list[float]]
-    prior: tuple[float, list[float]]
 
     @property
     def loss(self) -> float:
-        """Mean loss of the recordings, and the prior's."""
-        return float(np.mean(self.losses)) + self.prior[0]
+        """Mean loss of the recordings."""
+        return float(np.mean(self.losses))
 
     @property
     def gradient(self) -> Array:
         """Of the loss, (n)."""
-        total: Array = np.mean(self.gradients, axis=0) + np.array(self.prior[1])
-        return total
+        mean: Array = np.mean(self.gradients, axis=0)
+        return mean
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Independent normal distributions of the variables (n): their means and standard deviations.
+
+    The size of the model's errors is not known beforehand, and they are systematic: those of a whole fit tell as much
+    as `INDEPENDENT_ERRORS` independent ones. So the search minimises log loss + (2 / INDEPENDENT_ERRORS) p, where p is
+    half the sum of the squared deviations: a deviation by one standard deviation must lower the loss by a tenth.
+    """
+
+    mean: Array
+    deviation: Array
+
+    def value(self, x: Array) -> float:
+        """What it adds to log loss."""
+        return float((((x - self.mean) / self.deviation) ** 2).sum()) / INDEPENDENT_ERRORS
+
+    def slope(self, x: Array) -> Array:
+        """Gradient of `value`, (n)."""
+        slope: Array = 2.0 * (x - self.mean) / (self.deviation**2 * INDEPENDENT_ERRORS)
+        return slope
+
+    @property
+    def curvature(self) -> Array:
+        """Second derivatives of `value` by each variable, (n)."""
+        curvature: Array = 2.0 / (self.deviation**2 * INDEPENDENT_ERRORS)
+        return curvature
+
+    @classmethod
+    def flat(cls, count: int) -> "Prior":
+        """A prior that says nothing about `count` variables."""
+        return cls(np.zeros(count), np.full(count, np.inf))
 
 
 @dataclass(frozen=True)
@@ -90,7 +123,7 @@ class Minimum:
 
     Attributes:
         x: the variables, (n).
-        loss: at x, prior included.
+        loss: at x.
         curvature: Gauss-Newton matrix of the recordings' mean loss, computed at x or near it, (n, n).
     """
 
@@ -123,9 +156,7 @@ class MaterialSearch:
         quantities: to search for.
         history: of the run.
         checkpoint: file of earlier evaluations, which are not repeated.
-        prior_weight: what the prior adds to the loss where one variable lies `Quantity.spread` from its prior value,
-            times 2; 0 for no prior.
-        prior_at: prior values of the variables, (n).
+        prior: of the variables; none by default.
     """
 
     def __init__(
@@ -135,15 +166,13 @@ class MaterialSearch:
         quantities: tuple[Quantity, ...],
         history: History,
         checkpoint: Path,
-        prior_weight: float = 0.0,
-        prior_at: Array | None = None,
+        prior: Prior | None = None,
     ) -> None:
         used = prepare_datasets(datasets, settings)
         self.training = batches_by_dataset(training_items(used), settings.by_sigma)
         self.validation = validation_batches(used)
         self.quantities, self.settings, self.history = quantities, settings, history
-        self.prior_weight = prior_weight
-        self.prior_at = np.zeros(len(quantities)) if prior_at is None else prior_at
+        self.prior = prior or Prior.flat(len(quantities))
         self.simulator = used[0].simulator
         self.frames = 0  # number of frames to simulate
         self.evaluations: dict[tuple[float, ...], Evaluation] = {}  # by frames and variables
@@ -217,7 +246,7 @@ class MaterialSearch:
                 if not self.evaluations:
                     raise
                 count = len(self.recording_names)
-                return Evaluation([FAILURE_LOSS] * count, [[0.0] * len(x)] * count, self.prior(x))
+                return Evaluation([FAILURE_LOSS] * count, [[0.0] * len(x)] * count)
             self._save()
         return self.evaluations[key]
 
@@ -241,17 +270,7 @@ class MaterialSearch:
             assert variables.grad is not None
             losses += own.tolist()
             gradients += variables.grad.T.tolist()
-        return Evaluation(losses, gradients, self.prior(x))
-
-    def prior(self, x: Array) -> tuple[float, list[float]]:
-        """Loss and gradient (n) of the prior: half the sum of `prior_curvature` times the squares of x - x_prior."""
-        apart = x - self.prior_at
-        return 0.5 * float(self.prior_curvature @ apart**2), (self.prior_curvature * apart).tolist()
-
-    @property
-    def prior_curvature(self) -> Array:
-        """Second derivatives of the prior by each variable, (n)."""
-        return self.prior_weight / np.array([quantity.spread for quantity in self.quantities]) ** 2
+        return Evaluation(losses, gradients)
 
     def curvature(self, x: Array) -> Array:
         """Gauss-Newton matrix of the recordings' mean loss at x, (n, n), by differences, from a few recordings."""
@@ -298,20 +317,22 @@ class MaterialSearch:
         x, found, matrix = start, self.evaluate(start), self.curvature(start)
         at, length = start, 1.0  # where the matrix was computed; the fraction of a step to try
         for _ in range(evaluations):
-            model = matrix + np.diag(self.prior_curvature)
-            step = _bounded_step(model, found.gradient, lows - x, highs - x)
-            converged = not -(found.gradient @ step + 0.5 * step @ model @ step) > tolerance * found.loss
+            model = matrix + found.loss * np.diag(self.prior.curvature)
+            gradient = found.gradient + found.loss * self.prior.slope(x)
+            step = _bounded_step(model, gradient, lows - x, highs - x)
+            converged = not -(gradient @ step + 0.5 * step @ model @ step) > tolerance * found.loss
             if (converged or length < MIN_STEP) and (at != x).any() and tolerance < EARLY:
                 matrix, at, length = self.curvature(x), x, 1.0
                 continue
-            if converged or length < MIN_STEP:
+            if converged or length < MIN_STEP or found.loss < NEGLIGIBLE_LOSS:
                 break
             step *= length
-            expected = -(found.gradient @ step + 0.5 * step @ model @ step)
-            trial = self.evaluate(np.clip(x + step, lows, highs))
-            gained = (found.loss - trial.loss) / expected
+            expected = -(gradient @ step + 0.5 * step @ model @ step)
+            end = np.clip(x + step, lows, highs)
+            trial = self.evaluate(end)
+            gained = (found.loss - trial.loss * np.exp(self.prior.value(end) - self.prior.value(x))) / expected
             if gained > 0.0:
-                x, found, length = np.clip(x + step, lows, highs), trial, min(2.0 * length, 1.0)
+                x, found, length = end, trial, min(2.0 * length, 1.0)
                 self.record(x)
             else:
                 length *= 0.5
@@ -348,8 +369,8 @@ class MaterialSearch:
         inside = self.inside(minimum.x)
         covariance = np.full((len(minimum.x), len(minimum.x)), np.nan)
         found = self.evaluate(minimum.x)
-        matrix = (minimum.curvature + np.diag(self.prior_curvature))[np.ix_(inside, inside)]
-        gradient = found.gradient[inside]
+        matrix = (minimum.curvature + found.loss * np.diag(self.prior.curvature))[np.ix_(inside, inside)]
+        gradient = (found.gradient + found.loss * self.prior.slope(minimum.x))[inside]
         if len(inside) and np.linalg.eigvalsh(matrix)[0] > MIN_RELATIVE_CURVATURE * np.trace(matrix):
             inverse = np.linalg.inv(matrix)
             if gradient @ inverse @ gradient <= 2.0 * GOOD * found.loss:
@@ -390,8 +411,8 @@ class MaterialSearch:
         lows, highs = self.bounds
         variables = np.repeat(x[:, None], count, axis=1)
         for group in groups:
-            matrix = (1.0 - len(group) / count) * minimum.curvature + np.diag(self.prior_curvature)
-            slope = found.gradient - gradients[group].sum(0) / count
+            matrix = (1.0 - len(group) / count) * minimum.curvature + found.loss * np.diag(self.prior.curvature)
+            slope = found.gradient + found.loss * self.prior.slope(x) - gradients[group].sum(0) / count
             step = _bounded_step(matrix, slope, lows - x, highs - x)
             variables[:, group] = np.clip(x + step, lows, highs)[:, None]
         errors = np.concatenate(self._errors(variables))

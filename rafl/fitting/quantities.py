@@ -26,7 +26,7 @@ class Quantity:
         unit: for messages.
         scale: in the unit of the value.
         start: value to start from if the assumed material has none, or less.
-        spread: standard deviation of the variable's prior, where a search has one.
+        deviation: standard deviation of the variable's prior around the assumed material.
         learned: whether the quantity is a weight of the constitutive residual.
     """
 
@@ -37,7 +37,7 @@ class Quantity:
     unit: str
     scale: float = 1.0
     start: float = 0.0
-    spread: float = 1.0
+    deviation: float = 3.0
     learned: bool = False
 
     def variable(self, value: float) -> float:
@@ -59,8 +59,8 @@ class Quantity:
         return min(a, b), max(a, b)
 
 
-MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa", spread=0.05)
-POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "gap", "", scale=0.05)
+MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa", deviation=2.0)
+POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "gap", "", scale=0.05, deviation=1.0)
 VISCOSITY = Quantity("viscosity", 0.0, 1e4, "linear", "Pa s", scale=100.0, start=100.0)
 LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "linear", "", scale=0.1, start=0.1)
 # [Hz]; from the creep that a recording of a second or two shows (a relaxation time of 1 s) to half of 100 frames/s.
@@ -71,11 +71,11 @@ SHARES = tuple(
 )
 # Weights that change the stress by as much as the law has, or the loss factor by some hundredths, are unusual.
 ENERGY_WEIGHTS = tuple(
-    Quantity(f"energy_weight_{k + 1}", 0.0, 1.0 if k % 2 == 0 else 20.0, "linear", "", learned=True)
+    Quantity(f"energy_weight_{k + 1}", 0.0, 1.0 if k % 2 == 0 else 20.0, "linear", "", deviation=1.0, learned=True)
     for k in range(ENERGY_UNITS)
 )
 DISSIPATION_WEIGHTS = tuple(
-    Quantity(f"dissipation_weight_{k + 1}", 0.0, 1.0, "linear", "", scale=0.01, learned=True)
+    Quantity(f"dissipation_weight_{k + 1}", 0.0, 1.0, "linear", "", scale=0.01, deviation=1.0, learned=True)
     for k in range(VISCOSITY_UNITS)
 )
 METHOD_QUANTITIES = {

@@ -8,16 +8,16 @@ import pandas as pd
 
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.fitting.material_search import History, MaterialSearch, Minimum
+from rafl.fitting.material_search import History, MaterialSearch, Minimum, Prior
 from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
 from rafl.fitting.train_field import Report
 
 MIN_REPORTED_CORRELATION = 0.9
 MATERIAL_BELOW = "sysid-branches"  # the material that a constitutive residual begins from
-# The errors of a material are systematic: those of a whole fit tell as much as this many independent ones. So a learned
-# weight of one unit must lower the loss that the material leaves by a tenth to be worth it.
-INDEPENDENT_ERRORS = 10.0
+# Standard deviations of the material's variables around the material found, where a constitutive residual is added: of
+# log E, of the others.
+KEPT_DEVIATIONS = 0.05, 1.0
 
 
 def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
@@ -55,7 +55,7 @@ def fit_constitutive(datasets: list[Dataset], settings: Settings, run: Path, rep
     )
     minimum = below.solve()
     search = add_constitutive_residual(below, minimum, datasets, run / "checkpoint.pt")
-    return _save(search, search.descend(search.prior_at, settings.epochs), run)
+    return _save(search, search.descend(search.prior.mean, settings.epochs), run)
 
 
 def add_constitutive_residual(
@@ -65,10 +65,13 @@ def add_constitutive_residual(
 
     It should start at its prior: the material found, and no residual.
     """
-    weight = 2.0 * minimum.loss / INDEPENDENT_ERRORS
     quantities = METHOD_QUANTITIES["constitutive"]
-    at = np.concatenate([minimum.x, np.zeros(len(quantities) - len(minimum.x))])
-    search = MaterialSearch(datasets, below.settings, quantities, below.history, checkpoint, weight, at)
+    learned = np.array([quantity.learned for quantity in quantities])
+    mean = np.concatenate([minimum.x, np.zeros(learned.sum())])
+    deviation = np.where(learned, [quantity.deviation for quantity in quantities], KEPT_DEVIATIONS[1])
+    deviation[0] = KEPT_DEVIATIONS[0]
+    prior = Prior(mean, deviation)
+    search = MaterialSearch(datasets, below.settings, quantities, below.history, checkpoint, prior)
     search.use_frames(1.0)
     return search
 
