@@ -1,9 +1,9 @@
 """A limit on the energy that a residual field may add to a body, so that no motion can grow without end.
 
 A field that was learned on some motions may feed energy into others, which then flutter. Here the field's work, the sum
-of f . dq over the frames, may never exceed a fraction of the energy scale of the motion: the fraction that it reached in
-training, with a margin. Where the next frame would exceed it, the force is scaled down; a force that takes energy out
-always acts in full. The body's energy is therefore at most the initial one and this limit.
+of f . dq over the frames, may never exceed a fraction of the energy scale of the motion: the fraction that it reached
+in training, with a margin. Where the next frame would exceed it, the force is scaled down; a force that takes energy
+out always acts in full. The body's energy is therefore at most the initial one and this limit.
 """
 
 import torch
