@@ -1,6 +1,6 @@
-"""The paper's sim-to-real study with a stricter simulator as the laboratory.
+"""The paper's sim-to-real study with stricter simulators as laboratories.
 
-    python tests/bench/sim2real.py [--quick] [--out build/sim2real]
+    python tests/bench/sim2real.py [--quick] [--out build/sim2real] [--lab viscous] [--lab rubber] [--lab crooked]
 
 Every shape is simulated, rendered to video, tracked, captured and fitted with the same commands as in a laboratory.
 Every model is tested on every shape. Resumable: results under --out are not computed again. --quick takes three shapes
@@ -31,11 +31,13 @@ from rafl.data.dataset_file import read_dataset
 from rafl.data.synthetic import loaded_equilibria, simulate_release
 from rafl.evaluation.metrics import BASELINE, compare_skipping_failures, latex_table, split_table
 from rafl.fem.material import Material
+from rafl.fem.maxwell import branch_shares, branch_times
 from rafl.fem.mesh import HexMesh
 from rafl.fitting.run_folder import FittedModel, load_model
 
 DATASETS = Path(__file__).parents[2] / "datasets"
 FPS = 100.0
+LABS = ("viscous", "rubber", "crooked")  # of datasets/experiments/sim2real.yaml
 FINISHED_MARK = "done"  # file in a run folder after the fit
 SIMULATION_BATCH = 4  # recordings simulated at once
 
@@ -56,6 +58,7 @@ class ModelFit:
 
 
 MODELS = {
+    "auto": ModelFit("auto"),
     "sysid": ModelFit("sysid"),
     "sysid-e": ModelFit("sysid-e"),
     "srl": ModelFit("srl"),
@@ -75,34 +78,34 @@ class StudySize:
         shapes: names; None for all of the study's.
         recordings: numbers of training, validation and test recordings; None for all.
         frames: of each recording; None for the study's own number.
-        epochs: by model.
+        epochs: by model; None for the default.
     """
 
     shapes: tuple[str, ...] | None
     recordings: tuple[int, int, int] | None
     frames: int | None
-    epochs: dict[str, int]
+    epochs: dict[str, int | None]
 
 
 FULL = StudySize(
     None,
     None,
     None,
-    {"sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12, "sysid-damping": 14, "rafl-from-sysid": 12},
+    {"auto": None, "sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12, "sysid-damping": 14, "rafl-from-sysid": 12},
 )
 QUICK = StudySize(
     ("canonical", "thicker-scaled", "shorter"),
     (3, 1, 2),
     50,
-    {"sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8, "sysid-damping": 8, "rafl-from-sysid": 4},
+    {"auto": None, "sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8, "sysid-damping": 8, "rafl-from-sysid": 4},
 )
 
 
 class Study:
-    """The experiment in one folder."""
+    """The experiment with one laboratory, in one folder."""
 
-    def __init__(self, out: Path, size: StudySize) -> None:
-        self.out, self.size = out, size
+    def __init__(self, lab: str, out: Path, size: StudySize) -> None:
+        self.lab, self.out, self.size = lab, out / lab, size
         self.plan: dict[str, Any] = yaml.safe_load((DATASETS / "experiments" / "sim2real.yaml").read_text())
         self.shapes = list(size.shapes or self.plan["shapes"])
         self.frames = size.frames or self.plan["frames"]
@@ -113,22 +116,29 @@ class Study:
     def specimen(self, shape: str) -> Path:
         return DATASETS / "specimens" / f"{shape}.yaml"
 
-    def models(self, shape: str) -> dict[str, int]:
+    def models(self, shape: str) -> dict[str, int | None]:
         """Epochs by model; `srl`, which is bound to one mesh, only where the mesh is that of the first shape."""
         nodes = [len(read_specimen(self.specimen(each)).mesh.vertices) for each in (shape, self.shapes[0])]
         return {name: n for name, n in self.size.epochs.items() if name != "srl" or nodes[0] == nodes[1]}
 
     def laboratory_specimen(self, shape: str) -> Specimen:
-        """The specimen with the finer mesh, the material and the time integration of the laboratory."""
-        described, lab = read_specimen(self.specimen(shape)), self.plan["lab"]
+        """The specimen as it is in the laboratory: finer mesh, true material, and what is not as described."""
+        described, lab = read_specimen(self.specimen(shape)), self.plan["labs"][self.lab]
         coarse = described.mesh
         axes = [np.unique(np.round(coarse.vertices[:, k], 9)) for k in range(3)]
         cells = [lab["refinement"] * (len(axis) - 1) for axis in axes]
-        mesh = HexMesh.box(cells, np.ptp(coarse.vertices, axis=0))
+        size = np.ptp(coarse.vertices, axis=0)
+        mesh, layout = HexMesh.box(cells, size), described.layout
+        if "crooked" in lab:
+            number = self.plan["shapes"].index(shape)
+            positions = layout.positions + misplaced(layout.positions, size, lab["crooked"], number)
+            mesh = replace(mesh, vertices=deviating(mesh.vertices, size, lab["crooked"]))
+            layout = replace(layout, positions=deviating(positions, size, lab["crooked"]))
         return replace(
             described,
             mesh=mesh,
-            material=Material(**lab["material"]),
+            layout=layout,
+            material=laboratory_material(lab["material"]),
             fixed=mesh.face_nodes("x-min"),
             loaded=mesh.face_nodes("x-max"),
             integrator=lab["integrator"],
@@ -205,12 +215,13 @@ class Study:
             if (run / FINISHED_MARK).exists():
                 continue
             print(f"{shape}: fitting {name}", flush=True)
-            resume = ["--resume"] if (run / "checkpoint.pt").exists() else []
+            resume = ["--resume"] if list(run.glob("checkpoint*.pt")) else []
             if not resume:
                 shutil.rmtree(run, ignore_errors=True)
             dataset = self.out / shape / f"{shape}.h5"
             start = ["--from", run.with_name(model.start)] if model.start else []
-            options = ["--method", model.method, "--epochs", epochs, *model.options, *start, *resume]
+            limit = [] if epochs is None else ["--epochs", epochs]
+            options = ["--method", model.method, *limit, *model.options, *start, *resume]
             run_command("rafl-fit", dataset, "--out", run, *options)
             (run / FINISHED_MARK).touch()
 
@@ -238,6 +249,45 @@ class Study:
         return pd.concat(tables).drop_duplicates("method")
 
 
+def laboratory_material(content: dict[str, Any]) -> Material:
+    """The material of a laboratory; `loss` stands for branches of a constant loss factor."""
+    values = dict(content)
+    if "loss" in values:
+        loss = values.pop("loss")
+        frequencies = (loss["from_hz"], loss["to_hz"])
+        shares = branch_shares(torch.tensor(loss["tan_delta"], dtype=torch.float64), *frequencies)
+        values |= {"branch_shares": tuple(shares.tolist()), "branch_times": branch_times(*frequencies)}
+    return Material(**values)
+
+
+def deviating(positions: np.ndarray, size: np.ndarray, crooked: dict[str, float]) -> np.ndarray:
+    """Positions (.., 3) [m] in a body of a size (3) [m] as described, in the one that was really made.
+
+    Its section is wider and lower, it gets thinner towards the tip, and it reaches a little into the clamp, which
+    therefore gives.
+    """
+    along = positions[..., 0] / size[0]
+    section = crooked["section_percent"] / 100
+    # Bending stiffness grows with the cube of the height.
+    height = (1.0 - section) * (1.0 - crooked["tip_softer_percent"] / 300 * along)
+    moved = positions.copy()
+    moved[..., 0] = positions[..., 0] - 1e-3 * crooked["clamp_gives_mm"] * (1.0 - along)
+    moved[..., 1] = 0.5 * size[1] + (1.0 + section) * (positions[..., 1] - 0.5 * size[1])
+    moved[..., 2] = 0.5 * size[2] + height * (positions[..., 2] - 0.5 * size[2])
+    return moved
+
+
+def misplaced(positions: np.ndarray, size: np.ndarray, crooked: dict[str, float], seed: int) -> np.ndarray:
+    """Distances [m], (M, 3), of dots from their described places, on their face of the body."""
+    random = np.random.default_rng(seed)
+    largest = 1e-3 * crooked["dots_off_mm"]
+    offset = random.uniform(-largest, largest, positions.shape)
+    offset *= np.minimum(1.0, largest / np.linalg.norm(offset, axis=1))[:, None]
+    distance = np.minimum(np.abs(positions), np.abs(size - positions))
+    offset[np.arange(len(positions)), distance.argmin(axis=1)] = 0.0
+    return offset
+
+
 def errors_by_method(dataset: Dataset, models: dict[str, FittedModel]) -> pd.DataFrame:
     """Errors by method; infinite for a model whose simulation fails."""
     compared, failures = compare_skipping_failures(dataset, models)
@@ -259,10 +309,22 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="three shapes, fewer recordings, less training")
     parser.add_argument("--out", type=Path, default=Path("build/sim2real"), help="folder for videos, datasets and runs")
     parser.add_argument("--results", type=Path, help="folder for the tables [that of the study]")
+    parser.add_argument("--lab", choices=LABS, action="append", help="only this laboratory [all]")
+    parser.add_argument("--model", choices=MODELS, action="append", help="only this model [all]")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    study = Study(options.out / ("quick" if options.quick else "full"), QUICK if options.quick else FULL)
-    results = options.results or study.out
+    size = QUICK if options.quick else FULL
+    if options.model:
+        size = replace(size, epochs={name: size.epochs[name] for name in options.model})
+    for lab in options.lab or LABS:
+        study = Study(lab, options.out / ("quick" if options.quick else "full"), size)
+        run_study(study, options.results or study.out)
+
+
+def run_study(study: Study, results: Path) -> None:
+    """Compute what is missing of a study; print and write its tables."""
+    print(f"laboratory {study.lab}", flush=True)
+    suffix = "" if study.lab == LABS[0] else f"-{study.lab}"
     for shape in study.shapes:
         study.build_dataset(shape)
         study.fit(shape)
@@ -272,8 +334,8 @@ def main() -> None:
         chosen = errors[errors["method"].isin([BASELINE, *(f"{name}@{shape}" for name in study.size.epochs)])]
         own_errors.append(chosen.assign(method=chosen["method"].str.removesuffix(f"@{shape}")))
     table = pd.concat(own_errors)
-    write_text(results / "sim2real.csv", table.to_csv(index=False, float_format="%.4f"))
-    write_text(results / "sim2real.tex", latex_table(table))
+    write_text(results / f"sim2real{suffix}.csv", table.to_csv(index=False, float_format="%.4f"))
+    write_text(results / f"sim2real{suffix}.tex", latex_table(table))
     value = table["mean_mm"].map("{:.3f}".format) + " +- " + table["std_mm"].map("{:.3f}".format)
     shown = table.assign(error=value).pivot(index="dataset", columns="method", values="error").loc[study.shapes]
     shown = shown.fillna("N/A")
@@ -300,9 +362,14 @@ def main() -> None:
             f"{method}: mean marker error [mm], trained on rows, tested on columns",
             matrix.map("{:.3f}".format).replace("nan", "N/A"),
         )
-        print(f"{method}: negative transfer in {worse} of {pairs} pairs of different shapes")
+        ratio = np.log((matrix / original[matrix.columns]).to_numpy())
+        own, others = (np.exp(np.nanmean(ratio[mask])) for mask in (~different, different))
+        print(
+            f"{study.lab}, {method}: negative transfer in {worse} of {pairs} pairs of different shapes; error over that of "
+            f"the baseline simulator, geometric mean: {own:.3f} on the own shape, {others:.3f} on the others"
+        )
         rows.append(matrix.rename_axis("trained_on").reset_index().assign(method=method))
-    write_text(results / "sim2real-transfer.csv", pd.concat(rows).to_csv(index=False, float_format="%.4f"))
+    write_text(results / f"sim2real{suffix}-transfer.csv", pd.concat(rows).to_csv(index=False, float_format="%.4f"))
 
 
 if __name__ == "__main__":
