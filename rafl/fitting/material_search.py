@@ -408,11 +408,12 @@ class MaterialSearch:
         """
         x, found, count = minimum.x, self.evaluate(minimum.x), len(self.recording_names)
         gradients = np.array(found.gradients)
+        left_over = found.gradient + found.loss * self.prior.slope(x)  # zero at an exact minimum
         lows, highs = self.bounds
         variables = np.repeat(x[:, None], count, axis=1)
         for group in groups:
             matrix = (1.0 - len(group) / count) * minimum.curvature + found.loss * np.diag(self.prior.curvature)
-            slope = found.gradient + found.loss * self.prior.slope(x) - gradients[group].sum(0) / count
+            slope = (len(group) * left_over - gradients[group].sum(0)) / count
             step = _bounded_step(matrix, slope, lows - x, highs - x)
             variables[:, group] = np.clip(x + step, lows, highs)[:, None]
         errors = np.concatenate(self._errors(variables))

@@ -365,8 +365,8 @@ def run_study(study: Study, results: Path) -> None:
         ratio = np.log((matrix / original[matrix.columns]).to_numpy())
         own, others = (np.exp(np.nanmean(ratio[mask])) for mask in (~different, different))
         print(
-            f"{study.lab}, {method}: negative transfer in {worse} of {pairs} pairs of different shapes; error over that of "
-            f"the baseline simulator, geometric mean: {own:.3f} on the own shape, {others:.3f} on the others"
+            f"{study.lab}, {method}: negative transfer in {worse} of {pairs} pairs of different shapes; error over "
+            f"that of the baseline simulator, geometric mean: {own:.3f} on the own shape, {others:.3f} on the others"
         )
         rows.append(matrix.rename_axis("trained_on").reset_index().assign(method=method))
     write_text(results / f"sim2real{suffix}-transfer.csv", pd.concat(rows).to_csv(index=False, float_format="%.4f"))
