@@ -112,7 +112,7 @@ bench-sim2real: install
 
 # Materials identified in two stand-in laboratories and carried to other shapes. Hours, resumable; QUICK=1 as well.
 bench-labs: install
-	$(BIN)/python tests/bench/labs.py $(if $(QUICK),--quick)
+	$(BIN)/python tests/bench/labs.py $(if $(QUICK),--quick,--results datasets/results)
 
 # The specimens' meshes compared with converged solutions.
 bench-mesh: install

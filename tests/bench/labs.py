@@ -104,6 +104,14 @@ MODELS = {
     "sysid-damping, full": Model("sysid-damping", {"integration": "full"}),
     "sysid-damping, selective": Model("sysid-damping", {"integration": "selective"}),
 }
+PUBLISHED = (  # in the documentation
+    "sysid-damping, full",
+    "sysid-damping, selective",
+    "sysid-damping",
+    "sysid-loss",
+    "sysid-branches",
+    "auto",
+)
 JUDGED = ("sysid-branches", "sysid-branches, neo-Hookean")
 # Bars for the judged models: largest relative error of E and of the loss factor, and largest mean test error [mm].
 MODULUS_BAR, LOSS_BAR = 0.02, 0.05
@@ -366,8 +374,8 @@ def material_table(laboratory: Laboratory) -> pd.DataFrame:
     )
 
 
-def report(laboratory: Laboratory) -> None:
-    """Print and write the tables of a laboratory, and compare with the bars."""
+def report(laboratory: Laboratory) -> pd.DataFrame:
+    """Print and write the tables of a laboratory, and compare with the bars; the errors of all models by shape."""
     title, shapes = laboratory.name, laboratory.size.shapes
     show(f"{title}: sag, and distance from half the time step", laboratory.convergence().round(4))
     tested = {(shape, name): laboratory.errors(shape, name) for shape in shapes for name in MODELS}
@@ -398,6 +406,8 @@ def report(laboratory: Laboratory) -> None:
         for label, value, bar, unit in bars:
             verdict = "holds" if value <= bar else "missed"
             print(f"{title}, {name}, {label}: {value:.3f} {unit}, bar {bar:g} {unit}: {verdict}")
+    published = errors.loc[[BASELINE, *PUBLISHED]].rename_axis("method").reset_index()
+    return published.melt("method", var_name="shape", value_name="mean_mm").assign(study=title)
 
 
 def main() -> None:
@@ -405,12 +415,14 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="three shapes, fewer recordings and frames")
     parser.add_argument("--out", type=Path, default=Path("build/labs"), help="folder for recordings, datasets and runs")
     parser.add_argument("--lab", choices=LABS, action="append", help="only this laboratory [all]")
+    parser.add_argument("--results", type=Path, help="folder for a table of the errors in all laboratories")
     options = parser.parse_args()
     torch.set_num_threads(1)
     size = QUICK if options.quick else FULL
     laboratories = [
         Laboratory(name, options.out / ("quick" if options.quick else "full"), size) for name in options.lab or LABS
     ]
+    tables: list[pd.DataFrame] = []
     for laboratory in laboratories:
         laboratory.convergence()
         for shape in size.shapes:
@@ -418,7 +430,10 @@ def main() -> None:
         for shape in size.shapes:
             for name in MODELS:
                 laboratory.errors(shape, name)
-        report(laboratory)
+        tables.append(report(laboratory))
+    if options.results:
+        columns = ["study", "shape", "method", "mean_mm"]
+        write_text(options.results / "labs.csv", pd.concat(tables)[columns].to_csv(index=False, float_format="%.4f"))
 
 
 if __name__ == "__main__":

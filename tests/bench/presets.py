@@ -4,11 +4,13 @@
 
 One material for all three recordings: that of the specimen file (`assumed`), or the one identified from all of them.
 How the recordings are used, see `beam_recordings.py`. The marker error is the mean distance in the plane of the swing.
+--leave-one-out fits to two of the recordings and predicts the third, in turn.
 Resumable: results under --out are not computed again.
 """
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,31 +25,33 @@ from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings
 from rafl.evaluation.oscillation import fit_oscillation
+from rafl.fitting.methods import METHODS
 from rafl.fitting.run_folder import FittedModel, Settings
-from rafl.fitting.sysid import identify_material, parameter_sentences
+from rafl.fitting.sysid import parameter_sentences
 from rafl.simulation.rollout import equilibrium
 
 SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
 ASSUMED = "assumed"
-METHODS = ("sysid-damping", "sysid-loss", "sysid-branches")
+IDENTIFIED = ("sysid-damping", "sysid-loss", "sysid-branches", "constitutive")
+LEFT_OUT = ("sysid-branches", "constitutive", "auto")
 # Name; entries that replace those of `material` in the specimen file; methods.
 CONFIGURATIONS: list[tuple[str, dict[str, str], tuple[str, ...]]] = [
     ("paper", {"preset": "paper"}, (ASSUMED, "sysid-damping")),
     ("physical, full", {"integration": "full"}, ("sysid-damping",)),
     ("physical, selective", {"integration": "selective"}, ("sysid-damping",)),
-    ("physical", {}, (ASSUMED, *METHODS)),
+    ("physical", {}, (ASSUMED, *IDENTIFIED)),
     ("physical, neo-hookean", {"law": "neo-hookean"}, ("sysid-branches",)),
     ("physical, yeoh", {"law": "yeoh"}, ("sysid-branches",)),
 ]
 IDENTIFICATION_FRAMES, EPOCHS = 80, 13
-HISTORY_METHODS = ("sysid-loss", "sysid-branches")
+HISTORY_METHODS = ("sysid-loss", "sysid-branches", "constitutive", "auto")
 
 
 def identify(dataset: Dataset, method: str, run: Path) -> FittedModel:
-    """The material that fits the motion of all recordings in the plane of the swing best."""
+    """The material that fits the motion of all training recordings in the plane of the swing best."""
     run.mkdir(parents=True, exist_ok=True)
     settings = Settings(method, (dataset.name,), EPOCHS, 0.0, 0.0, 0, IDENTIFICATION_FRAMES, 0, by_sigma=True)
-    return identify_material([dataset], settings, run, lambda row: None)
+    return METHODS[method]([dataset], settings, run, lambda row: None)
 
 
 def compare(dataset: Dataset, model: FittedModel, recordings: list[BeamRecording]) -> pd.DataFrame:
@@ -135,16 +139,43 @@ class Bench:
             print(f"{name}, {method}:", *parameter_sentences(pd.read_csv(parameters)), sep="\n  ")
         return pd.read_csv(path)
 
+    def leave_one_out(self, method: str) -> pd.DataFrame:
+        """The table of every recording as a model fitted to the others predicts it, computed or read."""
+        tables = []
+        for held_out in ("beam_gravity_V2_b", "beam_load52_V2_a", "beam_load101_V2_a"):
+            run = self.out / "leave-one-out" / held_out / method
+            path = run / "table.csv"
+            if not path.exists():
+                run.mkdir(parents=True, exist_ok=True)
+                specimen, recordings = self.specimen({}, run / "specimen.yaml")
+                dataset = moving_dataset(specimen, recordings, self.history(specimen, recordings))
+                items = dataset.trajectories
+                split = {name: replace(x, split="test" if name == held_out else "train") for name, x in items.items()}
+                dataset = replace(dataset, trajectories=split)
+                model = identify(dataset, method, run)
+                table = compare(dataset, model, [item for item in recordings if item.name == held_out])
+                table.insert(0, "model", model.method)
+                table.insert(0, "method", method)
+                table.to_csv(path, index=False)
+            tables.append(pd.read_csv(path))
+            print(tables[-1].round(3).to_string(index=False), flush=True)
+        return pd.concat(tables)
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recordings", type=Path, help="folder of the beam's recordings")
     parser.add_argument("--out", type=Path, required=True, help="folder for runs and results")
     parser.add_argument("--only", help="compute and print only configurations whose name starts like this")
+    parser.add_argument("--leave-one-out", action="store_true", help="predict each recording from the others")
     options = parser.parse_args()
     torch.set_num_threads(1)
     options.out.mkdir(parents=True, exist_ok=True)
     bench = Bench(options.recordings, options.out)
+    if options.leave_one_out:
+        held_out = pd.concat([bench.leave_one_out(method) for method in LEFT_OUT])
+        print(held_out.round(3).to_string(index=False))
+        return
     tables = [
         bench.run(name, entries, method)
         for name, entries, methods in CONFIGURATIONS
