@@ -78,7 +78,7 @@ def test_explicit_options_override_the_preset(specimen_file: Path, options: str,
 
 @pytest.mark.parametrize(
     ("preset", "integration", "integrator", "substeps", "layers"),
-    [("physical", "enhanced", "generalised-alpha", 2, 8), ("paper", "full", "implicit-euler", 1, 7)],
+    [("physical", "enhanced", "generalised-alpha", 3, 8), ("paper", "full", "implicit-euler", 1, 7)],
 )
 def test_presets(
     specimen_file: Path, preset: str, integration: str, integrator: str, substeps: int, layers: int
