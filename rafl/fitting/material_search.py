@@ -44,7 +44,7 @@ MIN_FRAMES = 8
 EVALUATIONS_PER_STAGE = 4
 # Largest decrease of the loss, relative to it, that the model still expects where a search ends: of values that are
 # reported, of a model that is only compared, and of an early stage.
-EXACT, GOOD, EARLY = 1e-3, 1e-2, 0.1
+EXACT, GOOD, EARLY = 1e-3, 3e-2, 0.1
 NORMAL_QUANTILE_95 = 1.959964  # a normal distribution has 95 % within this many sigmas
 FAILURE_LOSS = 1e6  # loss where a simulation fails
 NEGLIGIBLE_LOSS = 1e-14  # of markers within a nanometre
