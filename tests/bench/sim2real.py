@@ -114,7 +114,13 @@ class Study:
         self.split = {number: split for split, count in splits.items() for number in self.plan["split"][split][:count]}
 
     def specimen(self, shape: str) -> Path:
-        return DATASETS / "specimens" / f"{shape}.yaml"
+        """The specimen's file: the shape of the package, with preset `physical` and the assumed material."""
+        path = self.out / "specimens" / f"{shape}.yaml"
+        if not path.exists():
+            content = yaml.safe_load((DATASETS / "specimens" / f"{shape}.yaml").read_text())
+            content["material"]["preset"] = "physical"
+            write_text(path, yaml.safe_dump(content, sort_keys=False))
+        return path
 
     def models(self, shape: str) -> dict[str, int | None]:
         """Epochs by model; `srl`, which is bound to one mesh, only where the mesh is that of the first shape."""
@@ -124,10 +130,9 @@ class Study:
     def laboratory_specimen(self, shape: str) -> Specimen:
         """The specimen as it is in the laboratory: finer mesh, true material, and what is not as described."""
         described, lab = read_specimen(self.specimen(shape)), self.plan["labs"][self.lab]
-        coarse = described.mesh
-        axes = [np.unique(np.round(coarse.vertices[:, k], 9)) for k in range(3)]
-        cells = [lab["refinement"] * (len(axis) - 1) for axis in axes]
-        size = np.ptp(coarse.vertices, axis=0)
+        size = np.ptp(described.mesh.vertices, axis=0)
+        element = 1e-3 * np.array(yaml.safe_load(self.specimen(shape).read_text())["geometry"]["element_mm"])
+        cells = np.round(lab["refinement"] * size / element).astype(int)
         mesh, layout = HexMesh.box(cells, size), described.layout
         if "crooked" in lab:
             number = self.plan["shapes"].index(shape)
