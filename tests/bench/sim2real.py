@@ -130,9 +130,10 @@ class Study:
     def laboratory_specimen(self, shape: str) -> Specimen:
         """The specimen as it is in the laboratory: finer mesh, true material, and what is not as described."""
         described, lab = read_specimen(self.specimen(shape)), self.plan["labs"][self.lab]
-        size = np.ptp(described.mesh.vertices, axis=0)
-        element = 1e-3 * np.array(yaml.safe_load(self.specimen(shape).read_text())["geometry"]["element_mm"])
-        cells = np.round(lab["refinement"] * size / element).astype(int)
+        coarse = read_specimen(DATASETS / "specimens" / f"{shape}.yaml").mesh  # without a cut at the clamp
+        size = np.ptp(coarse.vertices, axis=0)
+        axes = [np.unique(np.round(coarse.vertices[:, k], 9)) for k in range(3)]
+        cells = [lab["refinement"] * (len(axis) - 1) for axis in axes]
         mesh, layout = HexMesh.box(cells, size), described.layout
         if "crooked" in lab:
             number = self.plan["shapes"].index(shape)
