@@ -114,7 +114,7 @@ def test_predicted_start_is_at_rest(small_specimen: rafl.Specimen, fitted: Path)
     )
     start = rafl.Start(torch.from_numpy(prediction.vertices[:1]), 0 * force, force, 0 * force[..., 0], ("hanging",))
     with torch.no_grad():
-        q, _ = rafl.rollout(simulator, start, 10, model.residual(simulator))
+        q, _ = rafl.rollout(simulator, start, 10, model.residual(simulator), model.parameters(simulator))
     assert float((q - q[0]).norm(dim=-1).max()) < 1e-5
 
 

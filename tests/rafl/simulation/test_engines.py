@@ -38,9 +38,12 @@ def engines(law: str, integration: str) -> tuple[CompiledEngine, ReferenceEngine
 def constitutive(
     engine: CompiledEngine, moduli: np.ndarray, damped: bool, random: np.random.Generator
 ) -> ConstitutiveState:
-    """State with these values of mu and lambda (B, 2) and, if `damped`, viscosity and stiffness damping."""
+    """State with these values of mu and lambda (B, 2) and, if `damped`, viscosity and stiffness damping.
+
+    The viscosity differs between the points.
+    """
     batch, cells, points = len(moduli), len(engine.mesh.hexes), len(engine.quadrature.points.shape)
-    own = np.zeros((batch, 5))
+    own = np.zeros((batch, 4))
     own[:, :2] = moduli
     enhanced = engine.integration == "enhanced"
     hourglass = None
@@ -49,9 +52,10 @@ def constitutive(
         hourglass = HourglassStiffness(elastic, viscous, 3e-3 * elastic)
     if not damped:
         return ConstitutiveState(own, hourglass=hourglass)
-    own[:, 2:] = [2400.0, 300.0, 900.0]
+    own[:, 2:] = [300.0, 900.0]
     return ConstitutiveState(
         own,
+        random.uniform(1000.0, 4000.0, (batch, cells, points)),
         random.normal(0, 20.0, (batch, cells, points, 6)),
         random.normal(0, 0.3, (batch, len(engine.mesh.vertices), 3)),
         100.0,
