@@ -64,7 +64,8 @@ def fit(
         limit_energy: whether the energy that a field adds to a motion is limited by what it added in training.
 
     Raises:
-        InputError: a file, the run folder or an option does not suit the method.
+        InputError: a file, the run folder or an option does not suit the method; or torchrun with a method that trains
+            in one process only.
         SimulationError: the simulator did not converge; the message names recording and step.
     """
     paths = [Path(path) for path in ([datasets] if isinstance(datasets, str | Path) else datasets)]
@@ -87,6 +88,11 @@ def fit(
         limit_energy=limit_energy,
     )
     check_inputs(method, loaded, Path(start) if start else None, integrator)
+    if process_count() > 1 and method != "rafl":
+        raise InputError(
+            f"torchrun: expected method rafl, the only one that trains on several processes, found {method}; run "
+            "rafl-fit without torchrun"
+        )
     if rank() == 0:  # of the processes that torchrun started
         open_run(Path(run), settings, resume)
         _notify_unused_settings(loaded, settings, notify)

@@ -9,8 +9,10 @@ import pandas as pd
 import pytest
 import torch
 
+from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import write_dataset
+from rafl.fitting.fit import fit
 from rafl.fitting.run_folder import load_model
 
 PROGRAM = Path(sys.executable).parent
@@ -39,3 +41,11 @@ def test_torchrun_equals_one_process(dataset: Dataset, tmp_path: Path) -> None:
     one, two = (pd.read_csv(tmp_path / name / "history.csv") for name in ("one", "two"))
     assert two["epoch"].tolist() == [0, 1, 2]
     assert two["loss"][2] == pytest.approx(one["loss"][2], rel=1e-5)
+
+
+def test_methods_of_one_process_are_refused(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_dataset(tmp_path / "a.h5", dataset)
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(InputError, match="torchrun: expected method rafl"):
+        fit(tmp_path / "a.h5", tmp_path / "run", "auto")
+    assert not (tmp_path / "run").exists()
