@@ -35,6 +35,7 @@ from rafl.fitting.auto import SELECTION_FILE, selection_sentences
 from rafl.fitting.distributed import rank
 from rafl.fitting.fit import fit as fit_model
 from rafl.fitting.methods import DEFAULT_EPOCHS
+from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, load_model
 from rafl.fitting.sysid import parameter_sentences
 from rafl.fitting.train_field import Report
@@ -66,7 +67,8 @@ def fit(
     first = rank() == 0  # of the processes that torchrun started
     open_writer = partial(_summary_writer(), run) if tensorboard and first else None
     with progress() as bar:
-        task = bar.add_task("epoch", total=options["epochs"] or DEFAULT_EPOCHS[method])
+        searches = method == "auto" or method in METHOD_QUANTITIES  # of several stages
+        task = bar.add_task("epoch", total=None if searches else options["epochs"] or DEFAULT_EPOCHS[method])
         report = _epoch_report(bar, task, open_writer, first)
         notify = partial(typer.echo, err=True)
         try:
@@ -142,10 +144,12 @@ def _describe(model: FittedModel) -> str:
             for key in ("youngs_modulus", "poissons_ratio", "viscosity", "branch_shares")
         )
         identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
-        if viscosity.numel():
+        if viscosity.numel() and viscosity > 0.0:
             identified += f", viscosity = {viscosity:.0f} Pa s"
         if shares.numel():
             identified += f", branches of {', '.join(f'{share:.3f}' for share in shares.tolist())} mu"
+        if model.material.get("energy_weights"):
+            identified += ", with a learned strain energy and viscosity"
         parts.append(identified)
     integration = f", time integration {model.time_integration['integrator']}" if model.time_integration else ""
     return " on ".join(parts) + integration

@@ -71,6 +71,14 @@ class Recordings:
         """The leading `frames` frames of the same recordings."""
         return replace(self, **{key: getattr(self, key)[:frames] for key in ("markers", "valid", "weight")})
 
+    @property
+    def square_motion(self) -> NDArray[np.float64]:
+        """Mean squared distance of the markers from their first positions [m^2], by recording (B)."""
+        seen = self.valid * self.valid[0]
+        square = (self.markers - self.markers[0]).square().sum(-1) * seen
+        mean: NDArray[np.float64] = (square.sum((0, 2)) / seen.sum((0, 2)).clamp_min(1.0)).numpy()
+        return mean
+
     def simulate(
         self, residual: ResidualForce | None = None, parameters: Parameters | None = None
     ) -> tuple[Tensor, Tensor]:

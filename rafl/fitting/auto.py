@@ -13,11 +13,12 @@ from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors
 from rafl.data.strain_range import StrainRange
-from rafl.fitting.material_search import GOOD, Array, History, MaterialSearch, Minimum, Prior
+from rafl.fitting.gauss_newton import GOOD, Array, Minimum, Prior
+from rafl.fitting.material_search import History, MaterialSearch
 from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, MODULUS, POISSON, Quantity, material_values
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
 from rafl.fitting.sysid import add_constitutive_residual
-from rafl.fitting.train_field import Report, training_items
+from rafl.fitting.train_field import Report, prepare_datasets, training_items
 from rafl.simulation.rollout import rollout
 
 SELECTION_FILE = "selection.csv"
@@ -34,7 +35,8 @@ class Candidate:
     Attributes:
         name: `original` for the assumed material, or a method.
         model: the model, fitted to all training recordings.
-        errors: mean marker error of each recording or dataset that was left out [m], (G).
+        errors: mean marker error of each recording or dataset that was left out [m], (G); infinite if a simulation
+            fails or gains energy.
     """
 
     name: str
@@ -46,10 +48,10 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
     """Identify the material, fit a constitutive residual on top, and keep the simplest model that predicts as well.
 
     The candidates are the assumed material; E, nu and Maxwell branches; and these with a learned strain energy and
-    viscosity. Each is judged by its error on the validation recordings and on every
-    training recording as predicted from the others; with several datasets, on every dataset as predicted from the
-    others. A candidate is kept if no later one has a smaller error by more than the standard error of the difference,
-    and if a free run of some seconds does not gain energy.
+    viscosity. Each is judged by its error on the validation recordings and on every training recording as predicted
+    from the others; with several datasets, on every dataset as predicted from the others. A candidate is kept if no
+    later one has a smaller error by more than the standard error of the difference. One that cannot simulate what it is
+    judged by, or whose free run of some seconds gains energy, is not kept.
 
     `selection.csv` in the run holds the errors of all candidates.
 
@@ -59,15 +61,14 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
     """
     training_items(datasets)
     history = History(run, report)
-    judge = _Judge(datasets)
+    judge = _Judge(prepare_datasets(datasets, settings))
     model = FittedModel(ASSUMED)
     candidates = [Candidate(ASSUMED, model, judge.assumed_errors(model))]
 
     def consider(name: str, search: MaterialSearch, minimum: Minimum) -> None:
         fitted = replace(search.model(minimum.x), method=name)
-        if judge.stays_calm(fitted):
-            candidates.append(Candidate(name, fitted, judge.errors(fitted, search, minimum)))
-            write_text(run / f"parameters-{name}.csv", search.parameter_table(minimum))
+        candidates.append(Candidate(name, fitted, judge.errors(fitted, search, minimum)))
+        write_text(run / f"parameters-{name}.csv", search.parameter_table(minimum))
 
     loss = MaterialSearch(datasets, settings, METHOD_QUANTITIES["sysid-loss"], history, run / "checkpoint-start.pt")
     start = _with_branches(loss.identified(loss.solve_leading_frames()))
@@ -111,20 +112,28 @@ def choose(candidates: list[Candidate], groups: int) -> Candidate:
     groups: number of recordings or datasets that were left out; without any, the identified material of fewest
     parameters is kept.
     """
+    usable = [each for each in candidates if np.isfinite(each.errors).all()]
     if groups == 0:
-        return candidates[min(1, len(candidates) - 1)]
-    for k, simple in enumerate(candidates):
-        gains = [simple.errors - other.errors for other in candidates[k + 1 :]]
+        return usable[min(1, len(usable) - 1)]
+    for k, simple in enumerate(usable):
+        gains = [simple.errors - other.errors for other in usable[k + 1 :]]
         if not any(gain.mean() > _uncertainty(gain, simple.errors) for gain in gains):
-            return simple
-    return candidates[-1]
+            break
+    return simple
 
 
 def _uncertainty(gain: NDArray[np.float64], error: NDArray[np.float64]) -> float:
     """Standard error of a mean gain; of a single one, the gain that counts."""
     if len(gain) == 1:
         return MIN_GAIN * float(error[0])
-    return float(gain.std(ddof=1) / np.sqrt(len(gain)))
+    return _standard_error(gain)
+
+
+def _standard_error(values: NDArray[np.float64]) -> float:
+    """Standard error of the mean of values (G); NaN for fewer than two, or if some are infinite."""
+    if len(values) < 2 or not np.isfinite(values).all():
+        return np.nan
+    return float(values.std(ddof=1) / np.sqrt(len(values)))
 
 
 def _table(candidates: list[Candidate], chosen: Candidate) -> pd.DataFrame:
@@ -135,7 +144,7 @@ def _table(candidates: list[Candidate], chosen: Candidate) -> pd.DataFrame:
             {
                 "model": item.name,
                 "left_out_mm": 1e3 * item.errors.mean() if count else np.nan,
-                "standard_error_mm": 1e3 * item.errors.std(ddof=1) / np.sqrt(count) if count > 1 else np.nan,
+                "standard_error_mm": 1e3 * _standard_error(item.errors),
                 "left_out": count,
                 "kept": item is chosen,
             }
@@ -146,7 +155,7 @@ def _table(candidates: list[Candidate], chosen: Candidate) -> pd.DataFrame:
 def selection_sentences(table: pd.DataFrame, model: FittedModel) -> list[str]:
     """Two sentences: what was kept and how sure it is, and where it is a guess; `table` is `selection.csv`."""
     kept = table[table["kept"]].iloc[0]
-    others = ", ".join(f"{row.model} {row.left_out_mm:.3g} mm" for row in table.itertuples() if not row.kept)
+    others = ", ".join(_judged(row.model, row.left_out_mm) for row in table.itertuples() if not row.kept)
     if kept["left_out"] == 0:
         first = f"kept {kept['model']}, of few parameters, because no second recording was there to judge by."
     else:
@@ -165,11 +174,14 @@ def selection_sentences(table: pd.DataFrame, model: FittedModel) -> list[str]:
     return [first, second]
 
 
+def _judged(name: str, error: float) -> str:
+    return f"{name} {error:.3g} mm" if np.isfinite(error) else f"{name} cannot be simulated"
+
+
 class _Judge:
     """What candidates are judged by: recordings left out of the training, and free runs."""
 
     def __init__(self, datasets: list[Dataset]) -> None:
-        self.datasets = datasets
         self.training = [Recordings.of(d, d.split("train")) for d in datasets if d.split("train")]
         self.validation = [Recordings.of(d, d.split("val")) for d in datasets if d.split("val")]
         counts = [len(recordings.names) for recordings in self.training]
@@ -186,9 +198,13 @@ class _Judge:
         return np.concatenate([grouped, self._simulated_errors(self.validation, model)])
 
     def errors(self, model: FittedModel, search: MaterialSearch, minimum: Minimum) -> NDArray[np.float64]:
-        """Errors [m] of a model where a search ended, on what was left out, (G)."""
-        grouped = search.left_out_errors(minimum, self.left_out) if self.left_out else []
-        return np.concatenate([grouped, self._simulated_errors(self.validation, model)])
+        """Errors [m] of a model where a search ended, on what was left out, (G); infinite if it must not be kept."""
+        try:
+            grouped = search.left_out_errors(minimum, self.left_out) if self.left_out else []
+            errors = np.concatenate([grouped, self._simulated_errors(self.validation, model)])
+        except SimulationError:
+            return np.full(max(self.groups, 1), np.inf)
+        return errors if self._stays_calm(model) else np.full(max(self.groups, 1), np.inf)
 
     def _simulated_errors(self, batches: list[Recordings], model: FittedModel) -> NDArray[np.float64]:
         errors: list[float] = []
@@ -199,10 +215,10 @@ class _Judge:
             errors += [float(each.mean()) for each in frame_errors(recordings, simulated)]
         return np.array(errors)
 
-    def stays_calm(self, model: FittedModel) -> bool:
+    def _stays_calm(self, model: FittedModel) -> bool:
         """Whether a free run of the recording of the largest motion ends, and ends slower than it began."""
-        recordings = max(self.training, key=_largest_motion)
-        own = int(np.argmax(_motions(recordings)))
+        recordings = max(self.training, key=lambda each: float(each.square_motion.max()))
+        own = int(np.argmax(recordings.square_motion))
         simulator = model.simulator(recordings.dataset.simulator)
         start = recordings.dataset.start([recordings.names[own]])
         steps = round(FREE_RUN / simulator.time_step)
@@ -228,15 +244,3 @@ class _Judge:
             found = own if found is None else found.united(own)
         assert found is not None
         return found.strain, found.rate
-
-
-def _motions(recordings: Recordings) -> NDArray[np.float64]:
-    """Largest distance of a marker from its first position [m], by recording."""
-    moved = torch.linalg.norm(recordings.markers - recordings.markers[0], dim=-1)
-    both = recordings.valid * recordings.valid[0]
-    largest: NDArray[np.float64] = (moved * both).amax((0, 2)).numpy()
-    return largest
-
-
-def _largest_motion(recordings: Recordings) -> float:
-    return float(_motions(recordings).max())

@@ -7,12 +7,21 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors, loss_curvature, recording_losses
+from rafl.fitting.gauss_newton import (
+    EARLY,
+    EXACT,
+    MIN_RELATIVE_CURVATURE,
+    Evaluation,
+    Minimum,
+    Prior,
+    bounded_step,
+    descend,
+)
 from rafl.fitting.quantities import FIXED_POISSONS_RATIO, MODULUS, POISSON, Quantity, material_values
 from rafl.fitting.run_folder import (
     FORMAT,
@@ -42,94 +51,12 @@ START_FACTORS = (0.6, 1.7)  # times the assumed E: further starting points
 FRAME_FRACTIONS = (0.15, 0.4)
 MIN_FRAMES = 8
 EVALUATIONS_PER_STAGE = 4
-# Largest decrease of the loss, relative to it, that the model still expects where a search ends: of values that are
-# reported, of a model that is only compared, and of an early stage.
-EXACT, GOOD, EARLY = 1e-3, 3e-2, 0.1
 NORMAL_QUANTILE_95 = 1.959964  # a normal distribution has 95 % within this many sigmas
 FAILURE_LOSS = 1e6  # loss where a simulation fails
-NEGLIGIBLE_LOSS = 1e-14  # of markers within a nanometre
-MIN_LOSS = 1e-30  # smallest divisor, for a loss of zero
 DIFFERENCE_STEP = 1e-4  # of a variable, for the derivatives of the markers in the Gauss-Newton matrix
 # The Gauss-Newton matrix is that of up to so many recordings, from the largest to the least motion, and of so many
 # simulations at most, as long as one recording remains.
 CURVATURE_RECORDINGS, CURVATURE_SIMULATIONS = 3, 24
-MIN_RELATIVE_CURVATURE = 1e-12  # of the Gauss-Newton matrix; directions of less are taken as undetermined
-# Gain of a step relative to the expected one between which the matrix is kept: it changes slowly.
-GOOD_MODEL = (0.5, 1.5)
-INDEPENDENT_ERRORS = 10.0  # see `Prior`
-MIN_STEP = 0.05  # fraction of a step below which the search ends
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """The loss at some variables (n), for R training recordings.
-
-    Attributes:
-        losses: of every recording, see `rafl.data.objective.recording_losses`, (R).
-        gradients: of every recording's loss, exact, (R, n).
-    """
-
-    losses: list[float]
-    gradients: list[list[float]]
-
-    @property
-    def loss(self) -> float:
-        """Mean loss of the recordings."""
-        return float(np.mean(self.losses))
-
-    @property
-    def gradient(self) -> Array:
-        """Of the loss, (n)."""
-        mean: Array = np.mean(self.gradients, axis=0)
-        return mean
-
-
-@dataclass(frozen=True)
-class Prior:
-    """Independent normal distributions of the variables (n): their means and standard deviations.
-
-    The size of the model's errors is not known beforehand, and they are systematic: those of a whole fit tell as much
-    as `INDEPENDENT_ERRORS` independent ones. So the search minimises log loss + (2 / INDEPENDENT_ERRORS) p, where p is
-    half the sum of the squared deviations: a deviation by one standard deviation must lower the loss by a tenth.
-    """
-
-    mean: Array
-    deviation: Array
-
-    def value(self, x: Array) -> float:
-        """What it adds to log loss."""
-        return float((((x - self.mean) / self.deviation) ** 2).sum()) / INDEPENDENT_ERRORS
-
-    def slope(self, x: Array) -> Array:
-        """Gradient of `value`, (n)."""
-        slope: Array = 2.0 * (x - self.mean) / (self.deviation**2 * INDEPENDENT_ERRORS)
-        return slope
-
-    @property
-    def curvature(self) -> Array:
-        """Second derivatives of `value` by each variable, (n)."""
-        curvature: Array = 2.0 / (self.deviation**2 * INDEPENDENT_ERRORS)
-        return curvature
-
-    @classmethod
-    def flat(cls, count: int) -> "Prior":
-        """A prior that says nothing about `count` variables."""
-        return cls(np.zeros(count), np.full(count, np.inf))
-
-
-@dataclass(frozen=True)
-class Minimum:
-    """Where a search ended.
-
-    Attributes:
-        x: the variables, (n).
-        loss: at x.
-        curvature: Gauss-Newton matrix of the recordings' mean loss, computed at x or near it, (n, n).
-    """
-
-    x: Array
-    loss: float
-    curvature: Array
 
 
 @dataclass
@@ -289,7 +216,7 @@ class MaterialSearch:
 
         The others are taken to have the same matrix, in proportion to their mean squared motion.
         """
-        motion = _square_motion(recordings)
+        motion = recordings.square_motion
         chosen = _spread_by_size(motion, count)
         few = recordings.select(chosen)
         sets = x + DIFFERENCE_STEP * np.vstack([np.zeros(len(x)), np.eye(len(x))])
@@ -305,40 +232,10 @@ class MaterialSearch:
         return own * float(motion.mean() / motion[chosen].mean()) if motion[chosen].mean() > 0.0 else own
 
     def descend(self, start: Array, evaluations: int, tolerance: float = EXACT) -> Minimum:
-        """Minimise within bounds from a starting point by the Gauss-Newton method.
-
-        Every step minimises a quadratic model of the loss with the exact gradient and a Gauss-Newton matrix. A step
-        that does not lower the loss is halved. The matrix is computed again where the model foretold a gain badly. The
-        search ends where the model expects to gain less than `tolerance` times the loss, or after some evaluations.
-        """
+        """Minimise within bounds from a starting point; see `rafl.fitting.gauss_newton.descend`."""
         if not self.history.rows:
             self.record(start)
-        lows, highs = self.bounds
-        x, found, matrix = start, self.evaluate(start), self.curvature(start)
-        at, length = start, 1.0  # where the matrix was computed; the fraction of a step to try
-        for _ in range(evaluations):
-            model = matrix + found.loss * np.diag(self.prior.curvature)
-            gradient = found.gradient + found.loss * self.prior.slope(x)
-            step = _bounded_step(model, gradient, lows - x, highs - x)
-            converged = not -(gradient @ step + 0.5 * step @ model @ step) > tolerance * found.loss
-            if (converged or length < MIN_STEP) and (at != x).any() and tolerance < EARLY:
-                matrix, at, length = self.curvature(x), x, 1.0
-                continue
-            if converged or length < MIN_STEP or found.loss < NEGLIGIBLE_LOSS:
-                break
-            step *= length
-            expected = -(gradient @ step + 0.5 * step @ model @ step)
-            end = np.clip(x + step, lows, highs)
-            trial = self.evaluate(end)
-            gained = (found.loss - trial.loss * np.exp(self.prior.value(end) - self.prior.value(x))) / expected
-            if gained > 0.0:
-                x, found, length = end, trial, min(2.0 * length, 1.0)
-                self.record(x)
-            else:
-                length *= 0.5
-            if not GOOD_MODEL[0] <= gained <= GOOD_MODEL[1] and (at != x).any():
-                matrix, at = self.curvature(x), x
-        return Minimum(x, found.loss, matrix)
+        return descend(self, start, self.bounds, self.prior, evaluations, tolerance)
 
     @property
     def bounds(self) -> tuple[Array, Array]:
@@ -373,7 +270,7 @@ class MaterialSearch:
         gradient = (found.gradient + found.loss * self.prior.slope(minimum.x))[inside]
         if len(inside) and np.linalg.eigvalsh(matrix)[0] > MIN_RELATIVE_CURVATURE * np.trace(matrix):
             inverse = np.linalg.inv(matrix)
-            if gradient @ inverse @ gradient <= 2.0 * GOOD * found.loss:
+            if gradient @ inverse @ gradient <= 2.0 * EXACT * found.loss:
                 freedom = max(self.observed - len(minimum.x), 1.0)
                 covariance[np.ix_(inside, inside)] = 2.0 * found.loss / freedom * inverse
         return covariance
@@ -386,7 +283,8 @@ class MaterialSearch:
     def parameter_table(self, minimum: Minimum) -> str:
         """CSV text with each value, its 95 % interval and its correlations with the others.
 
-        A value at its bound has no interval. No value has one if the search ended before a minimum.
+        Intervals end at the bounds. A value at its bound has none, and no value has one if the search ended before a
+        minimum.
         """
         x, covariance = minimum.x, self.covariance(minimum)
         sigma = np.sqrt(np.diag(covariance))
@@ -394,7 +292,8 @@ class MaterialSearch:
         lines = ["name,unit,value,low_95,high_95," + ",".join(f"correlation_{name}" for name in names)]
         signs = [1.0 if item.kind != "gap" else -1.0 for item in self.quantities]
         for k, q in enumerate(self.quantities):
-            ends = sorted(float(q.value(x[k] + sign * NORMAL_QUANTILE_95 * sigma[k])) for sign in (-1.0, 1.0))
+            margin = NORMAL_QUANTILE_95 * sigma[k]
+            ends = sorted(float(q.value(np.clip(x[k] + sign * margin, *q.bounds))) for sign in (-1.0, 1.0))
             correlation = [signs[k] * signs[j] * covariance[k, j] / (sigma[k] * sigma[j]) for j in range(len(x))]
             cells = [float(q.value(x[k])), *ends, *correlation]
             lines.append(f"{q.name},{q.unit}," + ",".join("" if np.isnan(cell) else f"{cell:.6g}" for cell in cells))
@@ -414,7 +313,7 @@ class MaterialSearch:
         for group in groups:
             matrix = (1.0 - len(group) / count) * minimum.curvature + found.loss * np.diag(self.prior.curvature)
             slope = (len(group) * left_over - gradients[group].sum(0)) / count
-            step = _bounded_step(matrix, slope, lows - x, highs - x)
+            step = bounded_step(matrix, slope, lows - x, highs - x)
             variables[:, group] = np.clip(x + step, lows, highs)[:, None]
         errors = np.concatenate(self._errors(variables))
         return [float(errors[group].mean()) for group in groups]
@@ -429,25 +328,6 @@ class MaterialSearch:
                 simulated, _ = recordings.simulate(parameters=self.parameters(own, recordings))
             errors.append(np.array([each.mean() for each in frame_errors(recordings, simulated)]))
         return errors
-
-
-def _bounded_step(matrix: Array, gradient: Array, low: Array, high: Array) -> Array:
-    """The step d (n) with low <= d <= high that minimises gradient . d + d . matrix d / 2."""
-    values, vectors = np.linalg.eigh(matrix)
-    roots = np.sqrt(np.maximum(values, MIN_RELATIVE_CURVATURE * max(values[-1], MIN_LOSS)))
-    right = -(vectors.T @ gradient) / roots
-    margin = 1e-15 + 1e-12 * (high - low)  # bounds that meet at zero leave the solver no room
-    found = lsq_linear(roots[:, None] * vectors.T, right, (low - margin, high + margin), method="bvls")
-    step: Array = np.clip(found.x, low, high)
-    return step
-
-
-def _square_motion(recordings: Recordings) -> Array:
-    """Mean squared distance of the markers from their first positions [m^2], by recording."""
-    seen = recordings.valid * recordings.valid[0]
-    square = (recordings.markers - recordings.markers[0]).square().sum(-1) * seen
-    mean: Array = (square.sum((0, 2)) / seen.sum((0, 2)).clamp_min(1.0)).numpy()
-    return mean
 
 
 def _spread_by_size(sizes: Array, count: int) -> list[int]:

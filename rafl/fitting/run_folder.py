@@ -64,7 +64,7 @@ class FittedModel:
         return own if self.time_integration in (None, own.time_integration) else replace(own, **self.time_integration)
 
     def residual(self, simulator: Simulator) -> ResidualForce | None:
-        """The residual force on a specimen, for one rollout, or None if this model has none.
+        """The residual force on a specimen, or None if this model has none. In rollouts its work is limited, if set.
 
         Raises:
             InputError: the model is not applicable to this mesh.

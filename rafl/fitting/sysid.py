@@ -8,7 +8,8 @@ import pandas as pd
 
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.fitting.material_search import History, MaterialSearch, Minimum, Prior
+from rafl.fitting.gauss_newton import Minimum, Prior
+from rafl.fitting.material_search import History, MaterialSearch
 from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
 from rafl.fitting.train_field import Report
@@ -84,7 +85,9 @@ def _save(search: MaterialSearch, minimum: Minimum, run: Path) -> FittedModel:
 
 
 def parameter_sentences(table: pd.DataFrame) -> list[str]:
-    """Sentences about the identified parameters; `table` is `parameters.csv`, read as a data frame."""
+    """Sentences about the identified parameters, learned weights left out; `table` is `parameters.csv` as read."""
+    learned = [quantity.name for quantity in METHOD_QUANTITIES["constitutive"] if quantity.learned]
+    table = table[~table["name"].isin(learned)].reset_index(drop=True)
     lines = []
     for row in table.to_dict("records"):
         unit = f" {row['unit']}" if isinstance(row["unit"], str) else ""

@@ -6,6 +6,8 @@ in training, with a margin. Where the next frame would exceed it, the force is s
 out always acts in full. The body's energy is therefore at most the initial one and this limit.
 """
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
@@ -17,31 +19,50 @@ MARGIN = 2.0  # times the largest fraction in training; other loads and shapes d
 MIN_FRACTION = 0.01  # for fields that only take energy out in training
 
 
+@dataclass(frozen=True)
 class LimitedForce:
-    """A residual force whose work is limited, for one rollout of a batch.
+    """A residual force whose work is limited in every rollout. Called on its own, it is the force without a limit.
 
-    Args:
+    Attributes:
         force: the residual force without a limit.
-        simulator, parameters: of the rollout.
+        simulator, parameters: of the rollouts.
         fraction: largest work of the force, relative to `energy_scale`.
     """
 
-    def __init__(self, force: ResidualForce, simulator: Simulator, parameters: Parameters, fraction: float) -> None:
-        self.force, self.simulator, self.parameters, self.fraction = force, simulator, parameters, fraction
+    force: ResidualForce
+    simulator: Simulator
+    parameters: Parameters
+    fraction: float
+
+    def __call__(self, q: Tensor, v: Tensor, external: Tensor) -> Tensor:
+        """The force without a limit [N], (B, N, 3)."""
+        return self.force(q, v, external)
+
+    def for_rollout(self) -> ResidualForce:
+        """The limited force for one rollout."""
+        return _LimitInRollout(self)
+
+
+class _LimitInRollout:
+    """A limited force and its work so far in one rollout of a batch."""
+
+    def __init__(self, limited: LimitedForce) -> None:
+        self.limited = limited
         self._limit: Tensor | None = None  # [J], (B)
         self._work = torch.zeros(0)  # done so far [J], (B)
         self._latest: tuple[Tensor, Tensor] | None = None  # positions and force at the start of the latest frame
 
     def __call__(self, q: Tensor, v: Tensor, external: Tensor) -> Tensor:
-        """The force at the start of a frame [N], (B, N, 3); call it once per frame, in order."""
+        """The force at the start of a frame [N], (B, N, 3)."""
+        own = self.limited
         if self._limit is None:
-            self._limit = self.fraction * energy_scale(self.simulator, self.parameters, q, v, external)
+            self._limit = own.fraction * energy_scale(own.simulator, own.parameters, q, v, external)
             self._work = torch.zeros(len(q), dtype=torch.float64)
         if self._latest is not None:
             before, force = self._latest
             self._work = self._work + (force * (q - before)).sum((1, 2)).detach()
-        force = self.force(q, v, external)
-        expected = self.simulator.time_step * (force * v).sum((1, 2)).detach()
+        force = own.force(q, v, external)
+        expected = own.simulator.time_step * (force * v).sum((1, 2)).detach()
         left = (self._limit - self._work).clamp_min(0.0)
         share = torch.where(expected > left, left / expected.clamp_min(1e-300), torch.ones_like(left))
         # No force that still does work is left where the limit is reached, whatever the body does within the frame.

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -15,6 +16,14 @@ from rafl.simulation.viscous_memory import ViscousMemory
 from rafl.solvers.linear import Factors
 
 ResidualForce = Callable[[Tensor, Tensor, Tensor], Tensor]
+
+
+@runtime_checkable
+class RolloutResidual(Protocol):
+    """A residual force that acts otherwise in a rollout, where it remembers the frames before."""
+
+    def for_rollout(self) -> ResidualForce:
+        """The force for one rollout, called once per frame in order."""
 
 
 FIRST_ACCELERATION_FRACTION = 0.25  # of a step, over which the initial acceleration is averaged
@@ -155,6 +164,8 @@ def simulate_steps(
     Raises:
         SimulationError: a step failed; names trajectory, step and residual.
     """
+    if isinstance(residual, RolloutResidual):
+        residual = residual.for_rollout()
     integrator = INTEGRATORS[simulator.integrator]
     body = _BodyBatch.of(simulator, parameters, start.added_mass)
     external = start.force + body.weight

@@ -40,6 +40,8 @@ def candidates(*errors: list[float]) -> list[Candidate]:
         (([3.0, 4.0, 5.0], [3.1, 3.9, 5.0], [2.9, 4.1, 5.1]), "0"),
         (([3.0], [1.0], [0.95]), "1"),  # of one recording a gain of 5 % does not count
         (([3.0, 4.0], [3.0, 4.1], [0.1, 0.2]), "2"),  # better only by what the middle one lacks
+        (([3.0, 4.0], [np.inf, np.inf], [0.1, 0.2]), "2"),  # a model that cannot be simulated
+        (([3.0, 4.0], [np.inf, np.inf], [np.inf, np.inf]), "0"),
     ],
 )
 def test_the_simplest_model_that_no_other_beats_is_kept(errors: tuple[list[float], ...], kept: str) -> None:
@@ -48,6 +50,7 @@ def test_the_simplest_model_that_no_other_beats_is_kept(errors: tuple[list[float
 
 def test_without_evidence_the_material_of_fewest_parameters_is_kept() -> None:
     assert choose(candidates([], [], []), 0).name == "1"
+    assert choose(candidates([], [np.inf], []), 0).name == "2"
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +76,7 @@ def test_default_fit_predicts_left_out_recordings(rubber: Dataset, tmp_path: Pat
     assert table["model"].tolist() == ["original", "sysid-branches", "constitutive"]
     assert table["left_out"].tolist() == [4] * 3  # three training recordings and one of validation
     kept = table[table["kept"]].iloc[0]
-    assert 1e-3 * kept["left_out_mm"] == pytest.approx(error, rel=2.0)
+    assert error / 3 < 1e-3 * kept["left_out_mm"] < 3 * error
     first, second = selection_sentences(table, model)
     assert kept["model"] in first
     assert "it is a guess" in second

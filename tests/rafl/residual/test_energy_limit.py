@@ -74,6 +74,17 @@ def test_a_field_that_feeds_energy_cannot_make_a_beam_flutter(beam: Simulator, r
     assert speed(limited)[-20:].max() < 2.0 * speed(limited)[:20].max()
 
 
+def test_every_rollout_begins_anew(beam: Simulator, release: Start) -> None:
+    """A limited force remembers nothing between rollouts; called on its own, it is the force without a limit."""
+    force = feed(beam, 8.0)
+    limited = LimitedForce(force, beam, beam.parameters(), FRACTION)  # type: ignore[arg-type]
+    first, _ = rollout(beam, release, 60, limited)
+    q, v = first[-1], torch.ones_like(first[-1])
+    for _ in range(3):
+        assert torch.equal(limited(q, v, v), force(q, v, v))  # type: ignore[operator]
+    assert torch.equal(rollout(beam, release, 60, limited)[0], first)
+
+
 def test_a_force_below_the_limit_is_not_changed(beam: Simulator, release: Start) -> None:
     force = feed(beam, -2.0)
     plain, forces = rollout(beam, release, 40, force)  # type: ignore[arg-type]
