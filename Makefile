@@ -108,7 +108,7 @@ bench-paper: install
 
 # The sim-to-real study with a stricter simulator as the laboratory. As long; QUICK=1 runs a short form.
 bench-sim2real: install
-	$(BIN)/python tests/bench/sim2real.py $(if $(QUICK),--quick,--results datasets/results)
+	$(BIN)/python tests/bench/sim2real.py $(if $(QUICK),--size quick,--results datasets/results)
 
 # Materials identified in two stand-in laboratories and carried to other shapes. Hours, resumable; QUICK=1 as well.
 bench-labs: install

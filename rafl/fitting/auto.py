@@ -13,11 +13,10 @@ from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors
 from rafl.data.strain_range import StrainRange
-from rafl.fitting.gauss_newton import GOOD, Array, Minimum, Prior
+from rafl.fitting.gauss_newton import GOOD, Minimum
 from rafl.fitting.material_search import History, MaterialSearch
-from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, MODULUS, POISSON, Quantity, material_values
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
-from rafl.fitting.sysid import add_constitutive_residual
+from rafl.fitting.sysid import BRANCHES, add_constitutive_residual, branches_search
 from rafl.fitting.train_field import Report, prepare_datasets, training_items
 from rafl.simulation.rollout import rollout
 
@@ -70,14 +69,9 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
         candidates.append(Candidate(name, fitted, judge.errors(fitted, search, minimum)))
         write_text(run / f"parameters-{name}.csv", search.parameter_table(minimum))
 
-    loss = MaterialSearch(datasets, settings, METHOD_QUANTITIES["sysid-loss"], history, run / "checkpoint-start.pt")
-    start = _with_branches(loss.identified(loss.solve_leading_frames()))
-    quantities = METHOD_QUANTITIES["sysid-branches"]
-    prior = Prior(_assumed(quantities, loss), np.array([quantity.deviation for quantity in quantities]))
-    branches = MaterialSearch(datasets, settings, quantities, history, run / "checkpoint-sysid-branches.pt", prior)
-    branches.use_frames(1.0)
+    branches, start = branches_search(datasets, settings, history, run / f"checkpoint-{BRANCHES}.pt", with_prior=True)
     minimum = branches.descend(start, settings.epochs, GOOD)
-    consider("sysid-branches", branches, minimum)
+    consider(BRANCHES, branches, minimum)
     learned = add_constitutive_residual(branches, minimum, datasets, run / "checkpoint-constitutive.pt")
     minimum = learned.descend(learned.prior.mean, settings.epochs, GOOD)
     consider("constitutive", learned, minimum)
@@ -90,20 +84,6 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
     if parameters.exists():
         write_text(run / "parameters.csv", parameters.read_text())
     return kept
-
-
-def _assumed(quantities: tuple[Quantity, ...], search: MaterialSearch) -> Array:
-    """Variables of the assumed material; branches that it does not have are zero."""
-    material = search.simulator.material
-    return np.array([np.clip(q.variable(float(getattr(material, q.name, q.low))), *q.bounds) for q in quantities])
-
-
-def _with_branches(identified: dict[str, float]) -> Array:
-    """Variables of `sysid-branches` for the same material as that of variables of `sysid-loss`."""
-    shares = material_values({LOSS_FACTOR.name: identified[LOSS_FACTOR.name]})["branch_shares"]
-    values = [identified[MODULUS.name], identified[POISSON.name], *shares.tolist()]
-    quantities = METHOD_QUANTITIES["sysid-branches"]
-    return np.array([np.clip(q.variable(x), *q.bounds) for q, x in zip(quantities, values, strict=True)])
 
 
 def choose(candidates: list[Candidate], groups: int) -> Candidate:

@@ -21,8 +21,8 @@ class Quantity:
     Attributes:
         name: in `rafl.simulation.parameters.Parameters`, `tan_delta`, or one of a list: `branch_share_1` and so on.
         low, high: bounds.
-        kind: the variable is, for a value p, `log`: log p; `gap`: (1/2 - p) / scale, in which bending is nearly linear;
-            `linear`: p / scale.
+        kind: the variable is, for a value p, `log`: log(p / scale); `log-gap`: log((1/2 - p) / scale), in which the
+            stiffness of elements that lock near p = 1/2 is nearly linear; `linear`: p / scale.
         unit: for messages.
         scale: in the unit of the value.
         start: value to start from if the assumed material has none, or less.
@@ -42,15 +42,14 @@ class Quantity:
 
     def variable(self, value: float) -> float:
         """The variable of a value."""
-        if self.kind == "log":
-            return float(np.log(value))
-        return (0.5 - value if self.kind == "gap" else value) / self.scale
+        scaled = (0.5 - value if self.kind == "log-gap" else value) / self.scale
+        return scaled if self.kind == "linear" else float(np.log(scaled))
 
     def value(self, variable: Any) -> Any:
         """The value of a variable, a float or a tensor."""
-        if self.kind == "log":
-            return (torch.exp if isinstance(variable, Tensor) else np.exp)(variable)
-        return 0.5 - self.scale * variable if self.kind == "gap" else self.scale * variable
+        if self.kind != "linear":
+            variable = (torch.exp if isinstance(variable, Tensor) else np.exp)(variable)
+        return 0.5 - self.scale * variable if self.kind == "log-gap" else self.scale * variable
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -60,7 +59,7 @@ class Quantity:
 
 
 MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa", deviation=2.0)
-POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "gap", "", scale=0.05, deviation=1.0)
+POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "log-gap", "", scale=0.05)
 VISCOSITY = Quantity("viscosity", 0.0, 1e4, "linear", "Pa s", scale=100.0, start=100.0)
 LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "linear", "", scale=0.1, start=0.1)
 # [Hz]; from the creep that a recording of a second or two shows (a relaxation time of 1 s) to half of 100 frames/s.

@@ -8,14 +8,14 @@ import pandas as pd
 
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.fitting.gauss_newton import Minimum, Prior
+from rafl.fitting.gauss_newton import Array, Minimum, Prior
 from rafl.fitting.material_search import History, MaterialSearch
-from rafl.fitting.quantities import METHOD_QUANTITIES
+from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, Quantity, material_values
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
 from rafl.fitting.train_field import Report
 
 MIN_REPORTED_CORRELATION = 0.9
-MATERIAL_BELOW = "sysid-branches"  # the material that a constitutive residual begins from
+BRANCHES = "sysid-branches"
 # Standard deviations of the material's variables around the material found, where a constitutive residual is added: of
 # log E, of the others.
 KEPT_DEVIATIONS = 0.05, 1.0
@@ -35,9 +35,11 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         InputError: no training recordings.
         SimulationError: the assumed material itself cannot be simulated.
     """
-    history = History(run, report)
-    quantities = METHOD_QUANTITIES[settings.method]
-    search = MaterialSearch(datasets, settings, quantities, history, run / "checkpoint.pt")
+    history, checkpoint = History(run, report), run / "checkpoint.pt"
+    if settings.method == BRANCHES:
+        search, start = branches_search(datasets, settings, history, checkpoint)
+        return _save(search, search.descend(start, settings.epochs), run)
+    search = MaterialSearch(datasets, settings, METHOD_QUANTITIES[settings.method], history, checkpoint)
     return _save(search, search.solve(), run)
 
 
@@ -51,12 +53,45 @@ def fit_constitutive(datasets: list[Dataset], settings: Settings, run: Path, rep
         SimulationError: the assumed material itself cannot be simulated.
     """
     history = History(run, report)
-    below = MaterialSearch(
-        datasets, settings, METHOD_QUANTITIES[MATERIAL_BELOW], history, run / "checkpoint-material.pt"
-    )
-    minimum = below.solve()
+    below, start = branches_search(datasets, settings, history, run / f"checkpoint-{BRANCHES}.pt")
+    minimum = below.descend(start, settings.epochs)
     search = add_constitutive_residual(below, minimum, datasets, run / "checkpoint.pt")
     return _save(search, search.descend(search.prior.mean, settings.epochs), run)
+
+
+def branches_search(
+    datasets: list[Dataset], settings: Settings, history: History, checkpoint: Path, with_prior: bool = False
+) -> tuple[MaterialSearch, Array]:
+    """A search for E, nu and Maxwell branches by all frames, and the variables that it should start at.
+
+    They are those of a constant loss factor, found by the leading frames: these do not tell several branches apart.
+
+    Args:
+        datasets: with the training recordings.
+        settings: of the fit.
+        history: of the run.
+        checkpoint: file of earlier evaluations; those of the loss factor are in `checkpoint-start.pt` beside it.
+        with_prior: whether values near the assumed material are more likely.
+    """
+    first = checkpoint.with_name("checkpoint-start.pt")
+    loss = MaterialSearch(datasets, settings, METHOD_QUANTITIES["sysid-loss"], history, first)
+    identified = loss.identified(loss.solve_leading_frames())
+    shares = material_values({LOSS_FACTOR.name: identified.pop(LOSS_FACTOR.name)})["branch_shares"]
+    quantities = METHOD_QUANTITIES[BRANCHES]
+    prior = None
+    if with_prior:
+        material = loss.simulator.material
+        assumed = [float(getattr(material, quantity.name, quantity.low)) for quantity in quantities]
+        prior = Prior(_variables(quantities, assumed), np.array([quantity.deviation for quantity in quantities]))
+    search = MaterialSearch(datasets, settings, quantities, history, checkpoint, prior)
+    search.use_frames(1.0)
+    return search, _variables(quantities, [*identified.values(), *shares.tolist()])
+
+
+def _variables(quantities: tuple[Quantity, ...], values: list[float]) -> Array:
+    """Variables of values, within the bounds."""
+    pairs = zip(quantities, values, strict=True)
+    return np.array([np.clip(quantity.variable(value), *quantity.bounds) for quantity, value in pairs])
 
 
 def add_constitutive_residual(
@@ -89,12 +124,18 @@ def parameter_sentences(table: pd.DataFrame) -> list[str]:
     learned = [quantity.name for quantity in METHOD_QUANTITIES["constitutive"] if quantity.learned]
     table = table[~table["name"].isin(learned)].reset_index(drop=True)
     lines = []
-    for row in table.to_dict("records"):
+    found = np.isfinite(table["low_95"]).any()
+    for row in table.to_dict("records") if found else []:
         unit = f" {row['unit']}" if isinstance(row["unit"], str) else ""
         interval = f"95 % interval {row['low_95']:.5g} to {row['high_95']:.5g}"
         if not np.isfinite(row["low_95"]):
-            interval = "no interval: the value is at its bound, or the search ended before a minimum"
+            interval = "no interval: the value is at its bound"
         lines.append(f"{row['name']} = {row['value']:.5g}{unit} ({interval})")
+    if not found:
+        lines.append(
+            "no 95 % intervals: the search ended near a minimum but not at it; rafl-fit --method sysid-branches "
+            "searches on"
+        )
     for a, b in itertools.combinations(range(len(table)), 2):
         c = float(table[f"correlation_{table['name'][b]}"][a])
         if abs(c) > MIN_REPORTED_CORRELATION:

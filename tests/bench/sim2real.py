@@ -1,10 +1,10 @@
 """The paper's sim-to-real study with stricter simulators as laboratories.
 
-    python tests/bench/sim2real.py [--quick] [--out build/sim2real] [--lab viscous] [--lab rubber] [--lab crooked]
+    python tests/bench/sim2real.py [--size full] [--out build/sim2real] [--lab viscous] [--lab rubber] [--lab crooked]
 
 Every shape is simulated, rendered to video, tracked, captured and fitted with the same commands as in a laboratory.
-Every model is tested on every shape. Resumable: results under --out are not computed again. --quick takes three shapes
-and fewer recordings, and trains less.
+Every model is tested on every shape. Resumable: results under --out are not computed again. `--size short` takes half
+of the recordings and shorter ones; `quick` takes three shapes and fewer recordings, and trains less.
 """
 
 import argparse
@@ -93,12 +93,14 @@ FULL = StudySize(
     None,
     {"auto": None, "sysid": 30, "sysid-e": 15, "srl": 400, "rafl": 12, "sysid-damping": 14, "rafl-from-sysid": 12},
 )
+SHORT = replace(FULL, recordings=(5, 1, 2), frames=100)
 QUICK = StudySize(
     ("canonical", "thicker-scaled", "shorter"),
     (3, 1, 2),
     50,
     {"auto": None, "sysid": 5, "sysid-e": 4, "srl": 75, "rafl": 8, "sysid-damping": 8, "rafl-from-sysid": 4},
 )
+SIZES = {"full": FULL, "short": SHORT, "quick": QUICK}
 
 
 class Study:
@@ -111,7 +113,9 @@ class Study:
         self.frames = size.frames or self.plan["frames"]
         counts = size.recordings or tuple(len(self.plan["split"][split]) for split in ("train", "val", "test"))
         splits = dict(zip(("train", "val", "test"), counts, strict=True))
-        self.split = {number: split for split, count in splits.items() for number in self.plan["split"][split][:count]}
+        self.split = {
+            number: split for split, count in splits.items() for number in evenly(self.plan["split"][split], count)
+        }
 
     def specimen(self, shape: str) -> Path:
         """The specimen's file: the shape of the package, with preset `physical` and the assumed material."""
@@ -255,6 +259,11 @@ class Study:
         return pd.concat(tables).drop_duplicates("method")
 
 
+def evenly(values: list[int], count: int) -> list[int]:
+    """`count` of some values at even places."""
+    return [values[k] for k in np.linspace(0, len(values) - 1, count).round().astype(int)]
+
+
 def laboratory_material(content: dict[str, Any]) -> Material:
     """The material of a laboratory; `loss` stands for branches of a constant loss factor."""
     values = dict(content)
@@ -312,18 +321,18 @@ def show(title: str, table: pd.DataFrame) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="three shapes, fewer recordings, less training")
+    parser.add_argument("--size", choices=SIZES, default="full", help="of the study [full]")
     parser.add_argument("--out", type=Path, default=Path("build/sim2real"), help="folder for videos, datasets and runs")
     parser.add_argument("--results", type=Path, help="folder for the tables [that of the study]")
     parser.add_argument("--lab", choices=LABS, action="append", help="only this laboratory [all]")
     parser.add_argument("--model", choices=MODELS, action="append", help="only this model [all]")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    size = QUICK if options.quick else FULL
+    size = SIZES[options.size]
     if options.model:
         size = replace(size, epochs={name: size.epochs[name] for name in options.model})
     for lab in options.lab or LABS:
-        study = Study(lab, options.out / ("quick" if options.quick else "full"), size)
+        study = Study(lab, options.out / options.size, size)
         run_study(study, options.results or study.out)
 
 
