@@ -110,6 +110,58 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     return InitialState(best.q, best.force, np.sqrt(3.0) * _rms(frame, best.residual), best.pose)
 
 
+@dataclass(frozen=True)
+class LinearFit:
+    """A fit of the first frame by virtual forces that vary linearly over their nodes.
+
+    Attributes:
+        force: virtual nodal forces [N], (N, 3).
+        pose: from the frame of the target to the specimen frame.
+        q: node positions [m], (N, 3).
+        residual: markers of the mesh minus measured markers in the specimen frame [m], (3 M').
+        weight: of the residuals in the objective [1/m], (3 M').
+    """
+
+    force: Array
+    pose: RigidTransform
+    q: Array
+    residual: Array
+    weight: Array
+
+
+def fit_linear_forces(
+    frame: FirstFrame, pose: RigidTransform | None, model_sigma: float, start: LinearFit | None = None
+) -> LinearFit:
+    """Fit forces that vary linearly over the nodes, and the pose if an initial one is given, from an earlier fit.
+
+    model_sigma: standard deviation of the difference between mesh and specimen [m].
+
+    Raises:
+        SimulationError: an equilibrium could not be found.
+    """
+    search = _LevenbergMarquardt(frame, pose is not None, LOCAL_FORCE_SIGMAS[0], model_sigma)
+    force = np.zeros_like(frame.simulator.mesh.vertices) if start is None else start.force
+    found = search.minimise(force, start.pose if start else pose or IDENTITY, start.q if start else None)
+    return LinearFit(found.force, found.pose, found.q, found.residual, search.weight)
+
+
+def linear_jacobian(frame: FirstFrame, fit: LinearFit, with_pose: bool) -> tuple[Array, Array, Array]:
+    """Weighted derivatives of the residuals (3 M', n) by the linear modes of the forces and the pose.
+
+    Returns:
+        The derivatives, the precision matrix of the prior (n, n), and half the prior's gradient (n).
+    """
+    modes = np.kron(linear_modes(frame.simulator.mesh.vertices[frame.nodes]), np.eye(3))
+    jacobian = marker_jacobian(frame, fit.q) @ modes
+    prior = np.full(jacobian.shape[1], LINEAR_FORCE_SIGMA**-2.0)
+    slope = prior * (modes.T @ fit.force[frame.nodes].ravel())
+    if with_pose:
+        posed = fit.pose.apply(frame.target[frame.measured])
+        jacobian = np.concatenate([jacobian, -_pose_jacobian(posed)], axis=1)
+        prior, slope = (np.concatenate([part, np.zeros(6)]) for part in (prior, slope))
+    return fit.weight[:, None] * jacobian, np.diag(prior), slope
+
+
 def _rms(frame: FirstFrame, residual: Array) -> float:
     """Root mean square of the residuals (3 M') along observed axes [m]."""
     return float(np.sqrt((residual.reshape(-1, 3)[frame.observed_axes] ** 2).mean()))
@@ -236,13 +288,18 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
 
 def force_precision(positions: Array, local_sigma: float) -> Array:
     """Inverse prior covariance [1/N^2], (L, L), of one component of the forces on nodes at `positions` (L, 3)."""
-    extent = np.ptp(positions, axis=0).max()
-    modes = np.column_stack([np.ones(len(positions)), (positions - positions.mean(0)) / extent])
-    u, s, _ = np.linalg.svd(modes, full_matrices=False)
-    u = u[:, s > 1e-9 * s[0]]
-    linear = u @ u.T
+    modes = linear_modes(positions)
+    linear = modes @ modes.T
     precision: Array = linear / LINEAR_FORCE_SIGMA**2 + (np.eye(len(positions)) - linear) / local_sigma**2
     return precision
+
+
+def linear_modes(positions: Array) -> Array:
+    """Orthonormal values at `positions` (L, 3) of functions that are linear in the position, (L, up to 4)."""
+    extent = np.ptp(positions, axis=0).max()
+    functions = np.column_stack([np.ones(len(positions)), (positions - positions.mean(0)) / extent])
+    u, s, _ = np.linalg.svd(functions, full_matrices=False)
+    return np.asarray(u[:, s > 1e-9 * s[0]])
 
 
 def marker_jacobian(frame: FirstFrame, q: Array) -> Array:

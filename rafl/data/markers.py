@@ -48,6 +48,14 @@ class Markers:
             rows = [torch.autograd.grad(position[..., i].sum(), corners, retain_graph=True)[0] for i in range(3)]
         return torch.stack(rows, dim=-3)
 
+    def axes(self, q: Tensor) -> Tensor:
+        """Material axes at the markers, (..., M, 3, 3): the columns are two tangents [m] and the unit normal."""
+        corners = q[..., torch.from_numpy(self.quad), :]
+        along, across = torch.from_numpy(self._tangent_weights)
+        a, b = (corners * along[:, :, None]).sum(-2), (corners * across[:, :, None]).sum(-2)
+        normal = torch.linalg.cross(a, b)
+        return torch.stack([a, b, normal / torch.linalg.norm(normal, dim=-1, keepdim=True)], dim=-1)
+
     def _from_corners(self, corners: Tensor) -> Tensor:
         """Positions (..., M, 3) from the quads' corners (..., M, 4, 3)."""
         along, across = torch.from_numpy(self._tangent_weights)

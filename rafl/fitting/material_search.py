@@ -22,7 +22,7 @@ from rafl.fitting.gauss_newton import (
     bounded_step,
     descend,
 )
-from rafl.fitting.quantities import FIXED_POISSONS_RATIO, MODULUS, POISSON, Quantity, material_values
+from rafl.fitting.quantities import FIXED_POISSONS_RATIO, POISSON, Quantity, material_values
 from rafl.fitting.run_folder import (
     FORMAT,
     FittedModel,
@@ -45,15 +45,15 @@ from rafl.simulation.rollout import rollout
 
 Array = NDArray[Any]
 
-START_FACTORS = (0.6, 1.7)  # times the assumed E: further starting points
+START_FACTORS = (1.0, 0.6, 1.7)  # times the assumed E
+# Further starting points have this Poisson's ratio, that of nearly incompressible rubber: where elements lock, the loss
+# may have a minimum on either side.
+START_POISSONS_RATIO = 0.499
 # Each early stage of the search simulates a fraction of the frames, and a minimum number. Over many oscillations the
 # loss has other minima, where the simulation is whole oscillations ahead or behind.
 FRAME_FRACTIONS = (0.15, 0.4)
 MIN_FRAMES = 8
 EVALUATIONS_PER_STAGE = 4
-# Fraction of the squared motion that a stage must explain all but, or it tries the next starting point. A simulation
-# that is whole oscillations ahead or behind leaves several tenths.
-MAX_UNEXPLAINED = 0.01
 NORMAL_QUANTILE_95 = 1.959964  # a normal distribution has 95 % within this many sigmas
 FAILURE_LOSS = 1e6  # loss where a simulation fails
 DIFFERENCE_STEP = 1e-4  # of a variable, for the derivatives of the markers in the Gauss-Newton matrix
@@ -131,40 +131,28 @@ class MaterialSearch:
         return self.descend(start, self.settings.epochs, tolerance)
 
     def solve_leading_frames(self) -> Array:
-        """The best variables for the leading frames, from the best of several starting points.
+        """The best variables for the leading frames.
 
-        The others are tried as long as a good part of the motion remains unexplained.
+        The search starts from the assumed Poisson's ratio and from a high one, each with the best of several E.
         """
         self.use_frames(FRAME_FRACTIONS[0])
-        results: list[Minimum] = []
-        for point in sorted(self.starting_points(), key=lambda point: self.evaluate(point).loss):
-            results.append(self.descend(point, EVALUATIONS_PER_STAGE, EARLY))
-            if results[-1].loss < MAX_UNEXPLAINED * self.loss_at_rest():
-                break
-        best = min(results, key=lambda result: result.loss).x
-        for fraction in FRAME_FRACTIONS[1:]:
+        points = [min(points, key=lambda x: self.evaluate(x).loss) for points in self.starting_points()]
+        for fraction in FRAME_FRACTIONS:
             self.use_frames(fraction)
-            best = self.descend(best, EVALUATIONS_PER_STAGE, EARLY).x
-        return best
+            results = [self.descend(point, EVALUATIONS_PER_STAGE, EARLY) for point in points]
+            points = [result.x for result in results]
+        return min(results, key=lambda result: result.loss).x
 
-    def loss_at_rest(self) -> float:
-        """The loss of bodies that stay as they begin."""
-        losses = []
-        for recordings in (each.first_frames(self.frames) for each in self.training):
-            first = recordings.dataset.markers.positions(recordings.dataset.start(recordings.names).q)
-            losses += recording_losses(recordings, first).tolist()
-        return float(np.mean(losses))
-
-    def starting_points(self) -> list[Array]:
-        """Variables to start from; those of the assumed material come first."""
+    def starting_points(self) -> list[list[Array]]:
+        """Variables to start from, by Poisson's ratio; those of the assumed material come first."""
         assumed = [max(float(getattr(self.simulator.material, q.name, 0.0)), q.low, q.start) for q in self.quantities]
         own = np.array([np.clip(q.variable(x), *q.bounds) for q, x in zip(self.quantities, assumed, strict=True)])
-        points = [own]
-        for factor in START_FACTORS:
-            other = own.copy()
-            other[0] = np.clip(own[0] + np.log(factor), *MODULUS.bounds)
-            points.append(other)
-        return points
+        groups = [own]
+        if POISSON in self.quantities:
+            groups.append(own.copy())
+            groups[1][self.quantities.index(POISSON)] = POISSON.variable(START_POISSONS_RATIO)
+        steps = np.log(START_FACTORS)[:, None] * np.eye(len(own))[0]
+        return [[np.clip(group + step, *self.bounds) for step in steps] for group in groups]
 
     def identified(self, x: Any) -> dict[str, Any]:
         """Values of the quantities, by name, of variables x."""

@@ -26,10 +26,10 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
 
     Gradients are exact; the Gauss-Newton matrix is from differences of simulations that run as one batch.
 
-    The search starts from the datasets' assumed material and from a softer and a stiffer one, on the first frames of
-    the recordings. The best result continues with more frames, and finally with all. `parameters.csv` in the run
-    holds the values, their 95 % intervals and their correlations. A resumed run reads earlier simulations from its
-    checkpoint and does not repeat them.
+    The search starts on the first frames of the recordings, from the datasets' assumed material or a softer or stiffer
+    one, and likewise from one that is nearly incompressible. The best result continues with all frames.
+    `parameters.csv` in the run holds the values, their 95 % intervals and their correlations. A resumed run reads
+    earlier simulations from its checkpoint and does not repeat them.
 
     Raises:
         InputError: no training recordings.
