@@ -23,7 +23,8 @@ from rafl.common.errors import InputError, SimulationError
 from rafl.common.files import write_text
 from rafl.common.kernels import announce_compilation
 from rafl.data.dataset import Dataset
-from rafl.data.dataset_file import damaged_parts, update_dataset, write_dataset
+from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
+from rafl.data.markers import Markers
 
 DRAWN_MM = 2.0  # largest distance from the skin of the mesh at which a marker is drawn [mm]
 
@@ -115,7 +116,8 @@ def capture(
     described = read_specimen(specimen)
     rows = read_recording_rows(recordings, complete=not update)
     path = out or Path("datasets") / f"{described.name}.h5"
-    dataset = _built(described, tracks, rows, settings, recordings)
+    known = read_dataset(path).markers if update else None
+    dataset = _built(described, tracks, rows, settings, recordings, known)
     (update_dataset if update else write_dataset)(path, dataset)
     report = path.with_suffix(".html")
     write_dataset_report(report, described, dataset)
@@ -127,13 +129,18 @@ def capture(
 
 
 def _built(
-    specimen: Specimen, tracks: Path, rows: list[RecordingRow], settings: CaptureSettings, recordings: Path
+    specimen: Specimen,
+    tracks: Path,
+    rows: list[RecordingRow],
+    settings: CaptureSettings,
+    recordings: Path,
+    known: Markers | None,
 ) -> Dataset:
     recipe = f"{specimen.text}\n# recordings.csv\n{recordings.read_text(encoding='utf-8')}"
     with progress() as bar:
         task = bar.add_task("fitting first frames", total=len(rows))
         try:
-            return build_dataset(specimen, tracks, rows, settings, recipe, lambda: bar.advance(task))
+            return build_dataset(specimen, tracks, rows, settings, recipe, lambda: bar.advance(task), known)
         except SimulationError as error:
             raise InputError(f"{error}; does the first frame show the specimen at rest?") from None
 

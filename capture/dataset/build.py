@@ -1,7 +1,7 @@
 """Building of datasets: registers recordings to a specimen and fits their first frames."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from rafl.capture.dataset.sources import find_source, read_recording
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.initial import FirstFrame, InitialState, fit_first_frame, fit_velocity
+from rafl.capture.registration.places import find_places
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import (
     Registration,
@@ -28,12 +29,14 @@ from rafl.capture.registration.sequence import fit_by_sequence
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import MAX_RELATIVE_TIME_ERROR, Dataset, Trajectory
+from rafl.data.markers import Markers
 from rafl.data.synthetic import load_force
 
 Array = NDArray[Any]
 
 # Frames on each side of the first one; the polynomial through all of them gives the velocity in the first frame.
 VELOCITY_WINDOW_FRAMES = 2
+SAME_PLACE = 1e-9  # [m]
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,7 @@ def build_dataset(
     settings: CaptureSettings,
     recipe: str,
     tick: Callable[[], None],
+    known: Markers | None = None,
 ) -> Dataset:
     """Build the dataset of a specimen from its recordings.
 
@@ -79,12 +83,15 @@ def build_dataset(
         settings: tolerances and methods.
         recipe: text stored in the dataset.
         tick: called after every recording.
+        known: markers whose places were found earlier, for recordings that are added to a dataset.
 
     Raises:
         InputError: a file, marker or frame does not fit; the message names it.
         SimulationError: a first frame cannot be fitted.
     """
     markers = specimen.markers(settings.tolerance)
+    if known is not None:
+        _check_same_layout(markers, known)
 
     def read(name: str) -> Recording:
         return _in_layout_order(read_recording(find_source(folder, name), settings.fps), specimen, name)
@@ -96,11 +103,16 @@ def build_dataset(
         rest = fit_rest(recordings.get(name) or read(name), settings.rest, specimen, settings.fit_tolerance)
     simulator = specimen.simulator(_common_time_step(recordings))
     empty = Dataset(specimen.name, simulator, markers, {}, recipe)
-    trajectories = {}
+    registered = []
     for row in rows:
         recording = recordings[row.recording]
         registration = register(recording, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
-        trajectories[row.recording] = _trajectory(empty, specimen, recording, row, registration, settings)
+        registered.append(_Registered.of(specimen, recording, row, registration, settings))
+    markers = known or _found_markers(empty, specimen, registered, settings)
+    empty = replace(empty, markers=markers)
+    trajectories = {}
+    for item in registered:
+        trajectories[item.row.recording] = _trajectory(empty, specimen, item, settings)
         tick()
     dataset = Dataset(specimen.name, simulator, markers, trajectories, recipe)
     try:
@@ -153,28 +165,96 @@ def _in_layout_order(recording: Recording, specimen: Specimen, name: str) -> Rec
     )
 
 
-def _trajectory(
-    dataset: Dataset,
-    specimen: Specimen,
-    recording: Recording,
-    row: RecordingRow,
-    registration: Registration,
-    settings: CaptureSettings,
-) -> Trajectory:
-    """One recording from its release on, at even times, with its first frame fitted."""
-    own, simulator = len(specimen.layout.names), dataset.simulator
-    position = registration.pose.apply(recording.position[:, :own])
-    sigma = registration.pose.rotate_sigma(recording.sigma[:, :own])
-    position[:, [name in registration.outliers for name in specimen.layout.names]] = np.nan
-    # Positions as recorded: if a clamp marker jumps, a specimen at rest would seem to move in the frame of the clamp.
-    release, release_source = _release_and_source(recording.position[:, :own], row, settings)
-    last = len(recording.time) - 1 if row.last_frame is None else row.last_frame
-    if not release.start < last < len(recording.time):
+def _check_same_layout(markers: Markers, known: Markers) -> None:
+    """Raise InputError unless markers found earlier come from the same layout."""
+    described = known.rest if known.moved is None else known.rest - known.moved
+    if markers.names != known.names or np.abs(described - markers.rest).max() > SAME_PLACE:
         raise InputError(
-            f"recording {row.recording}: expected frames within 0 to {len(recording.time) - 1}, found "
-            f"{release.start} to {last}; correct recordings.csv"
+            "expected the markers of the dataset's own specimen file, found others, or at other places; build the "
+            "whole dataset again, without --update"
         )
-    frame = _first_frame(dataset, specimen, position, sigma, release, row.recording, settings.forces == "surface")
+
+
+@dataclass(frozen=True)
+class _Registered:
+    """A recording in the specimen frame.
+
+    Attributes:
+        recording, row, registration: of which it is made.
+        position, sigma: of the specimen's markers [m], (T, M, 3).
+        release: where the motion starts.
+        release_source: where that was found.
+        last: last frame that is used.
+    """
+
+    recording: Recording
+    row: RecordingRow
+    registration: Registration
+    position: Array
+    sigma: Array
+    release: Release
+    release_source: str
+    last: int
+
+    @classmethod
+    def of(
+        cls,
+        specimen: Specimen,
+        recording: Recording,
+        row: RecordingRow,
+        registration: Registration,
+        settings: CaptureSettings,
+    ) -> "_Registered":
+        """Transform a recording by its registration, without outliers, and find its release."""
+        own = len(specimen.layout.names)
+        position = registration.pose.apply(recording.position[:, :own])
+        sigma = registration.pose.rotate_sigma(recording.sigma[:, :own])
+        position[:, [name in registration.outliers for name in specimen.layout.names]] = np.nan
+        # Positions as recorded: if a clamp marker jumps, a specimen at rest would seem to move in the clamp's frame.
+        release, source = _release_and_source(recording.position[:, :own], row, settings)
+        last = len(recording.time) - 1 if row.last_frame is None else row.last_frame
+        if not release.start < last < len(recording.time):
+            raise InputError(
+                f"recording {row.recording}: expected frames within 0 to {len(recording.time) - 1}, found "
+                f"{release.start} to {last}; correct recordings.csv"
+            )
+        return cls(recording, row, registration, position, sigma, release, source, last)
+
+    def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
+        """Mean marker positions at rest before the release, or those of the first frame."""
+        rest = slice(self.release.rest_start, max(self.release.start, self.release.rest_start + 1))
+        target, sigma = average_frames(self.position[rest], self.sigma[rest])
+        name = self.row.recording
+        if np.isfinite(target[:, 0]).sum() < MIN_MARKERS:
+            raise InputError(
+                f"recording {name}, frame {self.release.start}: expected at least {MIN_MARKERS} markers, found fewer; "
+                "start at a later first_frame"
+            )
+        surface = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
+        nodes = surface if whole_surface else specimen.loaded
+        return FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface)
+
+
+def _found_markers(
+    dataset: Dataset, specimen: Specimen, registered: list[_Registered], settings: CaptureSettings
+) -> Markers:
+    """The markers at the places that the first frames show; as described if these are no equilibria."""
+    if settings.initial == "moving":
+        return dataset.markers
+    frames = [item.first_frame(dataset, specimen, whole_surface=False) for item in registered]
+    poses = [
+        fit_pose_near_clamp(specimen, frame.target) if item.registration.pose_from_model else None
+        for item, frame in zip(registered, frames, strict=True)
+    ]
+    prior_sigma = np.broadcast_to(specimen.layout.sigma, len(dataset.markers.names))
+    return find_places(frames, poses, prior_sigma).markers
+
+
+def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, settings: CaptureSettings) -> Trajectory:
+    """One recording from its release on, at even times, with its first frame fitted."""
+    simulator, recording, row, registration = dataset.simulator, item.recording, item.row, item.registration
+    position, sigma, release = item.position, item.sigma, item.release
+    frame = item.first_frame(dataset, specimen, settings.forces == "surface")
     initial = _fit_initial_state(frame, specimen, registration, settings)
     position, sigma = initial.pose.apply(position), initial.pose.rotate_sigma(sigma)
     velocity = np.zeros_like(initial.q)
@@ -183,7 +263,7 @@ def _trajectory(
     load = 1e-3 * row.load_g if row.load == "hanging" else 0.0
     added_mass = np.zeros(len(specimen.mesh.vertices))
     added_mass[specimen.loaded] = load / len(specimen.loaded)
-    chosen = slice(release.start, last + 1)
+    chosen = slice(release.start, item.last + 1)
     time, markers, sigma = _on_even_grid(recording, position, sigma, chosen, simulator.time_step, row)
     first = slice(release.start, release.start + 1)
     pose = initial.pose if registration.pose_from_model else registration.pose.select_frames(first)
@@ -210,7 +290,7 @@ def _trajectory(
             "registration_markers": ", ".join(f"{k} {1e3 * v:.3f}" for k, v in registration.residual.items()),
             "set_aside": ", ".join(registration.outliers),
             "first_frame": release.start,
-            "first_frame_from": release_source,
+            "first_frame_from": item.release_source,
             "still_frames": release.start - release.rest_start,
             "initial": settings.initial,
             "forces": settings.forces,
@@ -219,28 +299,6 @@ def _trajectory(
             "source": recording.source,
         },
     )
-
-
-def _first_frame(
-    dataset: Dataset,
-    specimen: Specimen,
-    position: Array,
-    sigma: Array,
-    release: Release,
-    name: str,
-    whole_surface: bool,
-) -> FirstFrame:
-    """Mean marker positions at rest before the release, or those of the first frame."""
-    rest = slice(release.rest_start, max(release.start, release.rest_start + 1))
-    target, target_sigma = average_frames(position[rest], sigma[rest])
-    if np.isfinite(target[:, 0]).sum() < MIN_MARKERS:
-        raise InputError(
-            f"recording {name}, frame {release.start}: expected at least {MIN_MARKERS} markers, found fewer; "
-            "start at a later first_frame"
-        )
-    surface = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
-    nodes = surface if whole_surface else specimen.loaded
-    return FirstFrame(dataset.simulator, dataset.markers, nodes, target, target_sigma, name, whole_surface)
 
 
 def _fit_initial_state(

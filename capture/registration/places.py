@@ -13,11 +13,14 @@ from rafl.data.markers import Markers, embed
 
 Array = NDArray[Any]
 
-MODULUS_SIGMA = 1.0  # prior standard deviation of log E around the assumed material
+MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
+MIN_PRIOR_SIGMA = 1e-9  # of a place that is exactly known [m]
 MAX_MODULUS_STEP = 0.3  # of log E in one iteration
 MAX_ITERATIONS = 10
 STEP_TOLERANCE = 1e-6  # [m]; the search ends with a smaller change of every place
-MIN_MODEL_SIGMA = 1e-6  # [m]
+# The mesh follows the shape of a bent specimen to about this fraction of its deflection, and not closer than this
+# distance [m]. The error is alike in all recordings, so that more of them do not average it out.
+MODEL_FRACTION, MIN_MODEL_SIGMA = 0.01, 1e-5
 
 
 @dataclass(frozen=True)
@@ -26,19 +29,13 @@ class Places:
 
     Attributes:
         markers: embedded at the places found.
-        moved: from the layout, along the axes of the specimen frame [m], (M, 3).
-        sigma: standard deviations of the places [m], (M, 3).
         youngs_modulus: with which the first frames agree best [Pa]; only the shapes under gravity tell it.
         modulus_sigma: standard deviation of its logarithm.
-        model_sigma: root mean square distance of the markers that remains beyond their measurement [m], per axis.
     """
 
     markers: Markers
-    moved: Array
-    sigma: Array
     youngs_modulus: float
     modulus_sigma: float
-    model_sigma: float
 
 
 def find_places(frames: list[FirstFrame], poses: list[RigidTransform | None], prior_sigma: Array) -> Places:
@@ -48,14 +45,15 @@ def find_places(frames: list[FirstFrame], poses: list[RigidTransform | None], pr
     log E, and for every recording the virtual forces that vary linearly over their nodes, and the pose where it is
     fitted too:
 
-        sum |x - target|^2 / (sigma^2 + model_sigma^2) + sum |moved|^2 / prior_sigma^2 + the forces' prior + E's prior
+        sum |x - target|^2 / (sigma^2 + R model_sigma^2) + sum |moved|^2 / prior_sigma^2 + the forces' prior + E's prior
 
-    The forces and poses are eliminated recording by recording (Schur complement).
+    with R recordings, and a model_sigma that follows from the deflection (`MODEL_FRACTION`). The forces and poses are
+    eliminated recording by recording (Schur complement).
 
     Args:
         frames: observations, with the markers embedded at their places in the layout.
         poses: initial poses where the pose is fitted too, else None, one for each frame.
-        prior_sigma: standard deviations of the places in the layout [m], (M, 3).
+        prior_sigma: standard deviations of the places in the layout [m], (M).
 
     Raises:
         SimulationError: an equilibrium could not be found.
@@ -64,38 +62,39 @@ def find_places(frames: list[FirstFrame], poses: list[RigidTransform | None], pr
     count, log_modulus, markers = len(layout.names), 0.0, layout
     moved = np.zeros((count, 3))
     fits: list[LinearFit | None] = [None] * len(frames)
-    model_sigma = float(prior_sigma.max())  # at first, the whole misplacement
-    precision = np.concatenate([[MODULUS_SIGMA**-2.0], prior_sigma.ravel() ** -2.0])
+    model_sigma = float(prior_sigma.max())  # until the deflection is known
+    by_place = np.repeat(np.maximum(prior_sigma, MIN_PRIOR_SIGMA) ** -2.0, 3)
+    precision = np.concatenate([[MODULUS_SIGMA**-2.0], by_place])
     for _ in range(MAX_ITERATIONS):
         modulus = simulator.material.youngs_modulus * np.exp(log_modulus)
         softened = replace(simulator, material=replace(simulator.material, youngs_modulus=modulus))
         current = [replace(frame, simulator=softened, markers=markers) for frame in frames]
         hessian, gradient = np.diag(precision), precision * np.concatenate([[log_modulus], moved.ravel()])
-        squares, freedom = 0.0, -float(1 + 3 * count)
+        deflection = []
         for k, (frame, pose) in enumerate(zip(current, poses, strict=True)):
             fit = fit_linear_forces(frame, pose, model_sigma, fits[k])
             fits[k] = fit
-            own_hessian, own_gradient, locals_count = _reduced_normal_equations(frame, fit, pose is not None)
+            own_hessian, own_gradient = _reduced_normal_equations(frame, fit, pose is not None)
             hessian += own_hessian
             gradient += own_gradient
-            squares += float((fit.residual**2).sum() - (frame.sigma[frame.measured] ** 2).sum())
-            freedom += fit.residual.size - locals_count
+            deflection.append(markers.positions(torch.from_numpy(fit.q)).numpy() - markers.rest)
         step = -np.linalg.solve(hessian, gradient)
-        print(f"{log_modulus:.4f} step {step[0]:.4f} model {1e3*model_sigma:.4f} places step {1e3*np.abs(step[1:]).max():.4f} rms {1e3*np.sqrt(squares/freedom):.4f} sE {np.linalg.inv(hessian)[0,0]**.5:.4f}", flush=True)
         log_modulus += float(np.clip(step[0], -MAX_MODULUS_STEP, MAX_MODULUS_STEP))
         moved = moved + step[1:].reshape(-1, 3)
         markers = embed(simulator.mesh, layout.names, layout.rest + moved)
-        model_sigma = float(np.sqrt(max(squares / max(freedom, 1.0), MIN_MODEL_SIGMA**2)))
+        size = float(np.sqrt(np.mean(np.square(deflection).sum(-1))))
+        model_sigma = float(np.sqrt(len(frames))) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
         if np.abs(step[1:]).max() < STEP_TOLERANCE:
             break
     covariance = np.linalg.inv(hessian)
     sigma = np.sqrt(np.diag(covariance))
+    markers = replace(markers, moved=moved, place_sigma=sigma[1:].reshape(-1, 3))
     modulus = simulator.material.youngs_modulus * float(np.exp(log_modulus))
-    return Places(markers, moved, sigma[1:].reshape(-1, 3), modulus, float(sigma[0]), model_sigma)
+    return Places(markers, modulus, float(sigma[0]))
 
 
-def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, with_pose: bool) -> tuple[Array, Array, int]:
-    """Half the Hessian and half the gradient by (log E, places), forces and pose eliminated, and how many these are."""
+def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, with_pose: bool) -> tuple[Array, Array]:
+    """Half the Hessian and half the gradient of one recording's part by (log E, places), less forces and pose."""
     local, prior, slope = linear_jacobian(frame, fit, with_pose)
     rows = np.flatnonzero(np.repeat(frame.measured, 3))
     whole = np.zeros((3 * len(frame.target), 1 + 3 * len(frame.target)))
@@ -113,4 +112,4 @@ def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, with_pose: bool
     mixed = local.T @ shared
     hessian = shared.T @ shared - mixed.T @ inverse @ mixed
     gradient = shared.T @ residual - mixed.T @ inverse @ (local.T @ residual + slope)
-    return hessian, gradient, local.shape[1]
+    return hessian, gradient

@@ -27,6 +27,8 @@ FORMAT = "rafl-dataset/1"
 UNITS = "SI: m, s, kg, N, Pa; specimen frame: origin at a corner of the clamped face, x to the tip, z up"
 SPECIMEN_GROUPS = ("mesh", "material", "markers")  # groups that all recordings share
 HASH_ATTRIBUTE = "sha256"
+MARKER_ARRAYS = ("rest", "quad", "weights", "normal_offset")
+FOUND_ARRAYS = ("moved", "place_sigma")  # of markers whose places were found; missing in files of markers as described
 # Unit and frame of every array, by its name. The hashes cover these texts: changing one breaks updates of older files.
 UNITS_AND_FRAMES = {
     "vertices": ("m", "specimen, at rest"),
@@ -36,6 +38,8 @@ UNITS_AND_FRAMES = {
     "quad": ("1", "vertices, anticlockwise from outside"),
     "weights": ("1", "of the quad's vertices"),
     "normal_offset": ("m", "outward normal of the quad"),
+    "moved": ("m", "specimen, at rest; from the description"),
+    "place_sigma": ("m", "specimen, at rest; one standard deviation"),
     "time": ("s", "from the first frame on"),
     "markers": ("m", "specimen"),
     "valid": ("1", "whether seen"),
@@ -116,8 +120,9 @@ def _write(file: h5py.File, dataset: Dataset, recipe: str) -> None:
     _write_array(file, "mesh/fixed", simulator.fixed)
     # Files of materials without branches stay as they were before there were branches, so that they can be updated.
     file.create_group("material").attrs.update({key: x for key, x in vars(simulator.material).items() if x != ()})
-    for key in ("rest", "quad", "weights", "normal_offset"):
-        _write_array(file, f"markers/{key}", getattr(markers, key))
+    for key in (*MARKER_ARRAYS, *FOUND_ARRAYS):
+        if getattr(markers, key) is not None:
+            _write_array(file, f"markers/{key}", getattr(markers, key))
     file["markers/names"] = np.array(markers.names, dtype=h5py.string_dtype())
     file.create_group("trajectories")
     for name, item in dataset.trajectories.items():
@@ -230,9 +235,9 @@ def _read(file: h5py.File) -> Dataset:
         str(file.attrs.get("integrator", "implicit-euler")),
         int(file.attrs.get("substeps", 1)),
     )
-    keys = ("rest", "quad", "weights", "normal_offset")
+    keys = (*MARKER_ARRAYS, *(key for key in FOUND_ARRAYS if key in file["markers"]))
     names = tuple(name.decode() for name in file["markers/names"][()])
-    markers = Markers(names, *(file[f"markers/{key}"][()] for key in keys))
+    markers = Markers(names, **{key: file[f"markers/{key}"][()] for key in keys})
     trajectories = {
         name: Trajectory(
             **{key: group[key][()] for key in ("time", "markers", "valid", "sigma", "load", "added_mass")},

@@ -19,10 +19,12 @@ class Markers:
 
     Attributes:
         names: (M).
-        rest: layout positions in the specimen frame [m], (M, 3).
+        rest: positions at rest in the specimen frame [m], (M, 3).
         quad: vertices of each marker's boundary quad, anticlockwise seen from outside, (M, 4).
         weights: bilinear weights of the quad's vertices; they add up to 1, (M, 4).
         normal_offset: signed distance along the quad's outward normal [m], (M,).
+        moved: of `rest`, how far it was found from the specimen's description [m], (M, 3); None if it was not searched.
+        place_sigma: standard deviations of `rest` where it was found [m], (M, 3), or None.
     """
 
     names: tuple[str, ...]
@@ -30,11 +32,14 @@ class Markers:
     quad: NDArray[np.int64]
     weights: Array
     normal_offset: Array
+    moved: Array | None = None
+    place_sigma: Array | None = None
 
     def select(self, chosen: NDArray[np.int64]) -> "Markers":
         """The markers of the given rows."""
         names = tuple(self.names[k] for k in chosen)
-        return Markers(names, self.rest[chosen], self.quad[chosen], self.weights[chosen], self.normal_offset[chosen])
+        arrays = {key: value for key, value in vars(self).items() if isinstance(value, np.ndarray)}
+        return Markers(names, **{key: value[chosen] for key, value in arrays.items()})
 
     def positions(self, q: Tensor) -> Tensor:
         """Marker positions [m], (..., M, 3), at mesh positions q (..., N, 3); differentiable."""

@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 from rafl.common.yaml_files import StrictModel, read_yaml
 
 SPECIMEN_FORMAT = "rafl-specimen/1"
+DEFAULT_SIGMA_MM = 0.5  # standard deviation of a dot that a hand places with a ruler or a stencil
 
 
 class MarkerEntry(StrictModel):
@@ -18,6 +19,7 @@ class MarkerEntry(StrictModel):
 
     name: str = Field(min_length=1)
     at_mm: tuple[float, float, float]
+    at_sigma_mm: float = Field(default=DEFAULT_SIGMA_MM, ge=0)
 
 
 def _check_unique_names(markers: list[MarkerEntry]) -> list[MarkerEntry]:
@@ -42,16 +44,24 @@ class MarkerEntries(BaseModel):
 
 @dataclass(frozen=True)
 class MarkerLayout:
-    """The markers' names (M) and rest positions in the specimen frame [m], (M, 3)."""
+    """The markers of a specimen.
+
+    Attributes:
+        names: (M).
+        positions: at rest, in the specimen frame, as described [m], (M, 3).
+        sigma: standard deviations of the positions [m], (M), or one for all.
+    """
 
     names: tuple[str, ...]
     positions: NDArray[np.float64]
+    sigma: NDArray[np.float64] | float = 1e-3 * DEFAULT_SIGMA_MM
 
     @classmethod
     def of(cls, markers: list[MarkerEntry]) -> "MarkerLayout":
         """From a specimen file's entries."""
         positions = 1e-3 * np.array([marker.at_mm for marker in markers], dtype=float).reshape(-1, 3)
-        return cls(tuple(marker.name for marker in markers), positions)
+        sigma = 1e-3 * np.array([marker.at_sigma_mm for marker in markers], dtype=float)
+        return cls(tuple(marker.name for marker in markers), positions, sigma)
 
 
 def read_layout(path: Path) -> MarkerLayout:
