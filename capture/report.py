@@ -10,6 +10,7 @@ from rafl.capture.dataset.summary import warnings
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
+from rafl.data.markers import Markers
 from rafl.evaluation.figures import draw_specimens
 
 MAX_FRAMES_SHOWN = 9
@@ -42,6 +43,11 @@ frame. First frame fit: root mean square distance between the markers of the fit
 <h2>First-frame residuals of the markers [mm]</h2>
 <table><tr><th>marker</th>{% for name in names %}<th>{{ name }}</th>{% endfor %}</tr>
 {% for row in residuals %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
+{% if places %}<h2>Places of the markers</h2>
+<p class="note">How far each marker was found from its <code>at_mm</code> on the undeformed body, by the first frames of all
+recordings, and the standard deviation, along x, y and z [mm].</p>
+<table><tr><th>marker</th><th>x</th><th>y</th><th>z</th><th>sigma x</th><th>sigma y</th><th>sigma z</th></tr>
+{% for row in places %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>{% endif %}
 <h2>Registration</h2>
 <p class="note">Distance of each marker used from its layout position [mm]; sigma of the pose.</p>
 <ul>{% for line in registrations %}<li>{{ line }}</li>{% endfor %}</ul></html>
@@ -74,6 +80,7 @@ def write_dataset_report(path: Path, specimen: Specimen, dataset: Dataset) -> No
                 [marker, *(f"{values[k]:.3f}" if np.isfinite(values[k]) else "-" for values in residuals.values())]
                 for k, marker in enumerate(dataset.markers.names)
             ],
+            places=_places(dataset.markers),
             registrations=[_registration(name, item.attributes) for name, item in items.items()],
         )
     )
@@ -95,6 +102,14 @@ def _row(name: str, dataset: Dataset) -> list[object]:
         f"{values['registration_residual_mm']:.3f}",
         f"{values['fit_residual_mm']:.3f}",
     ]
+
+
+def _places(markers: Markers) -> list[list[str]]:
+    """Rows of the table of places; none if they were not searched."""
+    if markers.moved is None or markers.place_sigma is None:
+        return []
+    values = 1e3 * np.concatenate([markers.moved, markers.place_sigma], axis=1)
+    return [[name, *(f"{x:.2f}" for x in row)] for name, row in zip(markers.names, values, strict=True)]
 
 
 def _registration(name: str, values: dict[str, object]) -> str:

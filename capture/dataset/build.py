@@ -238,7 +238,11 @@ class _Registered:
 def _found_markers(
     dataset: Dataset, specimen: Specimen, registered: list[_Registered], settings: CaptureSettings
 ) -> Markers:
-    """The markers at the places that the first frames show; as described if these are no equilibria."""
+    """The markers at the places that the first frames show; as described if these are no equilibria.
+
+    Raises:
+        InputError: the places are farther from the described ones than the tolerance.
+    """
     if settings.initial == "moving":
         return dataset.markers
     frames = [item.first_frame(dataset, specimen, whole_surface=False) for item in registered]
@@ -247,7 +251,15 @@ def _found_markers(
         for item, frame in zip(registered, frames, strict=True)
     ]
     prior_sigma = np.broadcast_to(specimen.layout.sigma, len(dataset.markers.names))
-    return find_places(frames, poses, prior_sigma).markers
+    markers = find_places(frames, poses, prior_sigma).markers
+    distance = float(np.sqrt(np.mean(np.sum(np.square(markers.moved), axis=-1))))
+    if distance > settings.fit_tolerance:
+        raise InputError(
+            f"specimen {specimen.name}: expected the markers near their at_mm, found them {1e3 * distance:.2f} mm off in "
+            f"the first frames (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); check at_mm, that the "
+            "calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
+        )
+    return markers
 
 
 def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, settings: CaptureSettings) -> Trajectory:

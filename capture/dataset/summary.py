@@ -12,6 +12,9 @@ from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 
 
+MISPLACED_MM = 2.0  # farther from its description than a hand misplaces a dot: four usual standard deviations
+
+
 def recordings_table(dataset: Dataset) -> Table:
     """Table with one row per recording: split, load, first frame, and residuals of registration and first frame."""
     fits = ("registration [mm]", "first frame fit [mm]")
@@ -38,8 +41,16 @@ def _number(value: object, format_spec: str) -> str:
 
 
 def warnings(dataset: Dataset) -> list[str]:
-    """One message for each recording in which the registration left markers out."""
+    """One message for each misplaced marker and each recording in which the registration left markers out."""
     lines = []
+    moved = dataset.markers.moved
+    distances = np.zeros(len(dataset.markers.names)) if moved is None else 1e3 * np.linalg.norm(moved, axis=1)
+    for name, distance in zip(dataset.markers.names, distances, strict=True):
+        if distance > MISPLACED_MM:
+            lines.append(
+                f"marker {name}: found {distance:.1f} mm from its at_mm in the first frames; correct at_mm, or its name "
+                "in the tracks"
+            )
     for name, item in dataset.trajectories.items():
         if outliers := item.attributes.get("set_aside"):
             lines.append(

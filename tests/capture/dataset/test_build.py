@@ -8,12 +8,14 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rafl.capture.dataset.build import CaptureSettings, build_dataset
+from rafl.capture.dataset.summary import warnings
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
 from rafl.capture.registration.registration import RestPose
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import read_dataset, update_dataset, write_dataset
 from rafl.data.synthetic import load_force
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
@@ -298,3 +300,29 @@ def test_a_sigma_of_zero_is_refused(small_specimen: Specimen, truth: np.ndarray,
     write_q0_tracks(small_specimen, tmp_path, truth[1:], sigma)
     with pytest.raises(InputError, match=r"trajectories/q0/sigma: expected more than 0"):
         build(small_specimen, tmp_path)
+
+
+def test_a_dot_far_from_its_description_is_found_and_named(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    """The places are in the dataset and its file; recordings that are added later get the same ones."""
+    layout = small_specimen.layout
+    described = replace(layout, positions=layout.positions + np.eye(len(layout.names))[:, :1] * [4e-3, 0.0, 0.0])
+    specimen = replace(small_specimen, layout=described)
+    write_q0_tracks(specimen, tmp_path, truth[1:], np.full_like(truth[1:], 1e-5))
+    built = build(specimen, tmp_path)
+    assert built.markers.moved is not None
+    np.testing.assert_allclose(built.markers.moved[0], [-4e-3, 0.0, 0.0], atol=3e-4)
+    assert np.abs(built.markers.moved[1:]).max() < 3e-4
+    (line,) = warnings(built)
+    assert line.startswith(f"marker {layout.names[0]}: found 3.9 mm from its at_mm")
+    write_dataset(tmp_path / "small.h5", built)
+    again = read_dataset(tmp_path / "small.h5").markers
+    for key in ("rest", "moved", "place_sigma"):
+        np.testing.assert_array_equal(getattr(again, key), getattr(built.markers, key))
+    rows = [RecordingRow(recording="q0", load_g=60, split="val")]
+    added = build_dataset(specimen, tmp_path, rows, SETTINGS, "", lambda: None, again)
+    update_dataset(tmp_path / "small.h5", added)
+    assert read_dataset(tmp_path / "small.h5").split("val") == ["q0"]
+    with pytest.raises(InputError, match="without --update"):
+        build_dataset(small_specimen, tmp_path, rows, SETTINGS, "", lambda: None, again)

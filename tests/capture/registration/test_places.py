@@ -1,0 +1,93 @@
+"""The markers' places on the undeformed body, from first frames of a body whose dots are off their described places."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from rafl.capture.registration.initial import FirstFrame
+from rafl.capture.registration.places import Places, find_places
+from rafl.capture.registration.registration import fit_pose_near_clamp
+from rafl.capture.specimen.specimen import Specimen
+from rafl.data.markers import embed
+from rafl.data.synthetic import loaded_equilibria, with_material
+
+LOADS = np.array([0.02, 0.05, 0.08, 0.11])
+MARKER_SIGMA = 1e-5  # [m]
+
+
+def misplacement(specimen: Specimen) -> np.ndarray:
+    """Up to 0.5 mm along the skin for every dot [m], (M, 3)."""
+    random = np.random.default_rng(3)
+    offset = random.uniform(-0.35e-3, 0.35e-3, specimen.layout.positions.shape)
+    offset[:, 1] = 0.0  # the dots are on the sides
+    return offset
+
+
+def first_frames(specimen: Specimen, offset: np.ndarray, stiffness: float = 1.0) -> list[FirstFrame]:
+    """Equilibria of a body that is `stiffness` times as stiff as described, with dots off by `offset` [m]."""
+    simulator = specimen.simulator(0.01)
+    material = simulator.material
+    true = with_material(simulator, stiffness * material.youngs_modulus, material.poissons_ratio)
+    markers = specimen.markers(1e-6)
+    dots = embed(simulator.mesh, markers.names, markers.rest + offset)
+    random = np.random.default_rng(5)
+    frames = []
+    for load, q in zip(LOADS, loaded_equilibria(true, specimen.loaded, LOADS), strict=True):
+        target = dots.positions(torch.from_numpy(q)).numpy() + random.normal(0.0, MARKER_SIGMA, offset.shape)
+        sigma = np.full_like(target, MARKER_SIGMA)
+        frames.append(FirstFrame(simulator, markers, specimen.loaded, target, sigma, f"{1e3 * load:.0f} g"))
+    return frames
+
+
+def find(specimen: Specimen, frames: list[FirstFrame], prior_sigma: float = 0.5e-3, with_pose: bool = False) -> Places:
+    poses = [fit_pose_near_clamp(specimen, frame.target) if with_pose else None for frame in frames]
+    return find_places(frames, poses, np.full(len(frames[0].target), prior_sigma))
+
+
+@pytest.mark.parametrize("stiffness", [1.0, 1.4])
+def test_places_are_found_to_a_twentieth_of_a_millimetre(small_specimen: Specimen, stiffness: float) -> None:
+    offset = misplacement(small_specimen)
+    found = find(small_specimen, first_frames(small_specimen, offset, stiffness)).markers
+    assert found.moved is not None
+    assert found.place_sigma is not None
+    error = found.moved - offset
+    assert np.sqrt((offset[:, [0, 2]] ** 2).mean()) > 0.18e-3
+    assert np.sqrt((error[:, [0, 2]] ** 2).mean()) < 0.05e-3
+    assert (np.abs(error) < 3.0 * found.place_sigma).all()
+    np.testing.assert_allclose(found.rest, small_specimen.layout.positions + found.moved)
+
+
+def test_places_and_poses_are_found_together(small_specimen: Specimen) -> None:
+    """Without a known frame, the shape that the dots form is found; its position follows from their prior."""
+    offset = misplacement(small_specimen)
+    turn = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix()
+    frames = [
+        replace(frame, target=frame.target @ turn.T + np.array([0.003, -0.002, 0.004]))
+        for frame in first_frames(small_specimen, offset)
+    ]
+    found = find(small_specimen, frames, with_pose=True).markers
+    assert found.moved is not None
+    sides = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (found.rest, found.rest - found.moved + offset)]
+    described = np.linalg.norm(found.rest[:, None] - found.moved[:, None] - found.rest + found.moved, axis=-1)
+    assert np.sqrt(((sides[0] - sides[1]) ** 2).mean()) < 0.06e-3
+    assert np.sqrt(((described - sides[1]) ** 2).mean()) > 0.2e-3
+
+
+def test_places_that_are_exactly_known_stay(small_specimen: Specimen) -> None:
+    found = find(small_specimen, first_frames(small_specimen, misplacement(small_specimen)), prior_sigma=0.0).markers
+    assert found.moved is not None
+    assert np.abs(found.moved).max() < 1e-8
+
+
+def test_a_missing_marker_stays_with_its_prior(small_specimen: Specimen) -> None:
+    frames = first_frames(small_specimen, misplacement(small_specimen))
+    for frame in frames:
+        frame.target[4] = np.nan
+    found = find(small_specimen, frames).markers
+    assert found.moved is not None
+    assert found.place_sigma is not None
+    np.testing.assert_allclose(found.moved[4], 0.0, atol=1e-9)
+    np.testing.assert_allclose(found.place_sigma[4], 0.5e-3, rtol=1e-6)
