@@ -252,7 +252,8 @@ def _found_markers(
     ]
     prior_sigma = np.broadcast_to(specimen.layout.sigma, len(dataset.markers.names))
     markers = find_places(frames, poses, prior_sigma).markers
-    distance = float(np.sqrt(np.mean(np.sum(np.square(markers.moved), axis=-1))))
+    moved = np.linalg.norm(markers.rest - dataset.markers.rest, axis=1)
+    distance = float(np.sqrt((moved**2).mean()))
     if distance > settings.fit_tolerance:
         raise InputError(
             f"specimen {specimen.name}: expected the markers near their at_mm, found them {1e3 * distance:.2f} mm off in "

@@ -1,16 +1,18 @@
 """The marker layout: names and positions of the markers on the undeformed specimen."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag
 
 from rafl.common.yaml_files import StrictModel, read_yaml
 
 SPECIMEN_FORMAT = "rafl-specimen/1"
+MAX_GRID_LINES = 100  # rows, and columns, of a grid
 DEFAULT_SIGMA_MM = 0.5  # standard deviation of a dot that a hand places with a ruler or a stencil
 
 
@@ -21,16 +23,59 @@ class MarkerEntry(StrictModel):
     at_mm: tuple[float, float, float]
     at_sigma_mm: float = Field(default=DEFAULT_SIGMA_MM, ge=0)
 
+    def markers(self) -> list["MarkerEntry"]:
+        """The marker itself."""
+        return [self]
 
-def _check_unique_names(markers: list[MarkerEntry]) -> list[MarkerEntry]:
-    names = [marker.name for marker in markers]
+
+# Directions of the columns and rows of a grid, by the axis of its face.
+GRID_DIRECTIONS = {
+    "x": ((0.0, 1.0, 0.0), (0.0, 0.0, -1.0)),
+    "y": ((1.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
+    "z": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)),
+}
+
+
+class MarkerGrid(StrictModel):
+    """Markers in rows and columns on one face, numbered row by row: `L` gives L1, L2, and so on.
+
+    `at_mm` is the first one. On the side faces columns follow x and rows go down; on top and bottom rows follow y; on
+    the ends columns follow y and rows go down. `spacing_mm` is that of columns and of rows, or one number for both.
+    """
+
+    name: str = Field(min_length=1)
+    face: Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
+    at_mm: tuple[float, float, float]
+    rows: int = Field(ge=1, le=MAX_GRID_LINES)
+    columns: int = Field(ge=1, le=MAX_GRID_LINES)
+    spacing_mm: Annotated[float, Field(gt=0)] | tuple[Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]]
+    at_sigma_mm: float = Field(default=DEFAULT_SIGMA_MM, ge=0)
+
+    def markers(self) -> list[MarkerEntry]:
+        """The markers of the grid."""
+        spacing = self.spacing_mm if isinstance(self.spacing_mm, tuple) else (self.spacing_mm, self.spacing_mm)
+        across, down = np.array(GRID_DIRECTIONS[self.face[0]]) * np.array(spacing)[:, None]
+        entries = []
+        for number, (row, column) in enumerate(np.ndindex(self.rows, self.columns), start=1):
+            x, y, z = (self.at_mm + row * down + column * across).round(9).tolist()
+            entries.append(MarkerEntry(name=f"{self.name}{number}", at_mm=(x, y, z), at_sigma_mm=self.at_sigma_mm))
+        return entries
+
+
+def _check_unique_names(markers: list[MarkerEntry | MarkerGrid]) -> list[MarkerEntry | MarkerGrid]:
+    names = [marker.name for item in markers for marker in item.markers()]
     repeated = {name for name in names if names.count(name) > 1}
     if repeated:
         raise ValueError(f"expected different names, {sorted(repeated)[0]} occurs more than once")
     return markers
 
 
-MarkerList = Annotated[list[MarkerEntry], AfterValidator(_check_unique_names)]
+def _kind(value: object) -> str:
+    return "grid" if isinstance(value, MarkerGrid) or (isinstance(value, dict) and "rows" in value) else "marker"
+
+
+_Item = Annotated[Annotated[MarkerEntry, Tag("marker")] | Annotated[MarkerGrid, Tag("grid")], Discriminator(_kind)]
+MarkerList = Annotated[list[_Item], AfterValidator(_check_unique_names)]
 
 
 class MarkerEntries(BaseModel):
@@ -57,8 +102,9 @@ class MarkerLayout:
     sigma: NDArray[np.float64] | float = 1e-3 * DEFAULT_SIGMA_MM
 
     @classmethod
-    def of(cls, markers: list[MarkerEntry]) -> "MarkerLayout":
+    def of(cls, items: Sequence[MarkerEntry | MarkerGrid]) -> "MarkerLayout":
         """From a specimen file's entries."""
+        markers = [marker for item in items for marker in item.markers()]
         positions = 1e-3 * np.array([marker.at_mm for marker in markers], dtype=float).reshape(-1, 3)
         sigma = 1e-3 * np.array([marker.at_sigma_mm for marker in markers], dtype=float)
         return cls(tuple(marker.name for marker in markers), positions, sigma)
