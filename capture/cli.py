@@ -96,12 +96,21 @@ class Forces(StrEnum):
     surface = "surface"
 
 
+class Unit(StrEnum):
+    """Unit of positions."""
+
+    m = "m"
+    cm = "cm"
+    mm = "mm"
+
+
 @capture_app.command()
 @report_errors
 def capture(
     specimen: Annotated[Path | None, typer.Argument(help="Specimen description (specimen.yaml).")] = None,
     tracks: Annotated[
-        Path | None, typer.Argument(help="Folder of tracks (.h5), motion capture (.c3d) or q0.npy, q1.npy, ...")
+        Path | None,
+        typer.Argument(help="Folder of tracks (.h5), motion capture (.c3d, .trc, .tsv, .csv) or q0.npy, q1.npy, ..."),
     ] = None,
     recordings: Annotated[Path | None, typer.Option(help="Table of recordings: recording,load_g,split.")] = None,
     out: Annotated[Path | None, typer.Option(help="Dataset to write [datasets/SPECIMEN.h5].")] = None,
@@ -127,7 +136,15 @@ def capture(
         ),
     ] = Initial.rest,
     forces: Annotated[Forces, typer.Option(help="Where the virtual forces of the first frame act.")] = Forces.tip,
-    fps: Annotated[float, typer.Option(min=0.1, help="Frames per second of npy files.")] = 100.0,
+    fps: Annotated[
+        float, typer.Option(min=0.1, help="Frames per second of files that do not name it (npy, DLTdv, ...).")
+    ] = 100.0,
+    unit: Annotated[
+        Unit | None, typer.Option(help="Unit of positions in tables that do not name it (DLTdv, anipose, DeepLabCut).")
+    ] = None,
+    names: Annotated[
+        Path | None, typer.Option(help="Table file,specimen of marker names in the files and in the specimen.")
+    ] = None,
     inspect: Annotated[Path | None, typer.Option(help="Only print the contents of a dataset.")] = None,
     verify: Annotated[Path | None, typer.Option(help="Only compare a dataset with its stored hashes.")] = None,
 ) -> None:
@@ -162,6 +179,8 @@ def capture(
         start,
         initial.value,
         forces.value,
+        unit and unit.value,
+        {} if names is None else commands.read_marker_names(names),
     )
     commands.capture(specimen, tracks, recordings, out, update, settings)
 

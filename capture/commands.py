@@ -10,6 +10,7 @@ from rich.console import Console
 
 from rafl.capture.dataset.build import CaptureSettings as CaptureSettings
 from rafl.capture.dataset.build import build_dataset
+from rafl.capture.dataset.naming import read_marker_names as read_marker_names
 from rafl.capture.dataset.summary import print_contents, recordings_table, warnings
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
 from rafl.capture.registration.registration import RestPose as RestPose
@@ -114,7 +115,7 @@ def capture(
     torch.set_num_threads(1)  # the element kernels have the other cores
     announce_compilation()
     described = read_specimen(specimen)
-    rows = read_recording_rows(recordings, complete=not update)
+    rows = read_recording_rows(recordings)
     path = out or Path("datasets") / f"{described.name}.h5"
     known = read_dataset(path).markers if update else None
     dataset = _built(described, tracks, rows, settings, recordings, known)

@@ -44,8 +44,8 @@ frame. First frame fit: root mean square distance between the markers of the fit
 <table><tr><th>marker</th>{% for name in names %}<th>{{ name }}</th>{% endfor %}</tr>
 {% for row in residuals %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 {% if places %}<h2>Places of the markers</h2>
-<p class="note">How far each marker was found from its <code>at_mm</code> on the undeformed body, by the first frames of all
-recordings, and the standard deviation, along x, y and z [mm].</p>
+<p class="note">How far each marker was found from its <code>at_mm</code> on the undeformed body, by the first frames of
+all recordings, and the standard deviation, along x, y and z [mm].</p>
 <table><tr><th>marker</th><th>x</th><th>y</th><th>z</th><th>sigma x</th><th>sigma y</th><th>sigma z</th></tr>
 {% for row in places %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>{% endif %}
 <h2>Registration</h2>

@@ -208,6 +208,8 @@ def track(
     announce_compilation()
     rig = read_calibration(calib)
     settings = TrackingSettings(read_layout(specimen) if specimen else None, fps, fill, sync)
+    layout = settings.layout
+    places = dict(zip(layout.names, layout.positions, strict=True)) if layout else {}
     recordings = find_recordings(videos, rig, calib)
     done: dict[str, Tracks] = {}
     failed: dict[str, str] = {}
@@ -238,7 +240,7 @@ def track(
                     write_overlay(path, video, camera, rig.cameras[camera], done[name], tick)
                     bar.remove_task(task)
             for kind in exports:
-                WRITERS[kind](out / export_name(kind, name, list(recordings).index(name)), done[name])
+                WRITERS[kind](out / export_name(kind, name, list(recordings).index(name)), done[name], places)
     if not done:
         first = next(iter(failed))
         raise InputError(f"recording {first}: {failed[first]}")

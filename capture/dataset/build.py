@@ -1,7 +1,7 @@
 """Building of datasets: registers recordings to a specimen and fits their first frames."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rafl.capture.dataset.sources import find_source, read_recording
+from rafl.capture.dataset.naming import in_layout_order
+from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.initial import FirstFrame, InitialState, fit_first_frame, fit_velocity
 from rafl.capture.registration.places import find_places
@@ -18,7 +19,6 @@ from rafl.capture.registration.registration import (
     Registration,
     RestPose,
     average_frames,
-    combined_layout,
     fit_pose_near_clamp,
     fit_rest,
     register,
@@ -53,6 +53,8 @@ class CaptureSettings:
         initial: `rest`: the first frame is an equilibrium; `moving`: it has a velocity; `sequence`: as `rest`, fitted
             by a sequence of forces over time.
         forces: virtual forces act on the `tip` or on the whole `surface`.
+        unit: of positions in tables that do not name it: m, cm or mm.
+        names: of markers in the specimen, by their names in the files, where they differ.
     """
 
     tolerance: float = 2e-3
@@ -63,6 +65,8 @@ class CaptureSettings:
     start: int | None = None
     initial: Literal["rest", "moving", "sequence"] = "rest"
     forces: Literal["tip", "surface"] = "tip"
+    unit: str | None = None
+    names: dict[str, str] = field(default_factory=dict)
 
 
 def build_dataset(
@@ -94,7 +98,12 @@ def build_dataset(
         _check_same_layout(markers, known)
 
     def read(name: str) -> Recording:
-        return _in_layout_order(read_recording(find_source(folder, name), settings.fps), specimen, name)
+        path, *others = find_sources(folder, name)
+        recording = read_recording(path, settings.fps, settings.unit)
+        if others:
+            beside = ", ".join(other.name for other in others)
+            recording = replace(recording, source=f"{recording.source}; beside it, not read: {beside}")
+        return in_layout_order(recording, specimen, name, settings.names)
 
     recordings = {row.recording: read(row.recording) for row in rows}
     rest = None
@@ -132,37 +141,6 @@ def _common_time_step(recordings: dict[str, Recording]) -> float:
                 "recordings with different frame rates into different datasets"
             )
     return step
-
-
-def _in_layout_order(recording: Recording, specimen: Specimen, name: str) -> Recording:
-    """The recording with its markers in the order of `combined_layout`."""
-    layout_names, _ = combined_layout(specimen)
-    if recording.names is None:
-        if recording.position.shape[1] != len(layout_names):
-            raise InputError(
-                f"recording {name}: expected {len(layout_names)} markers as in the specimen, found "
-                f"{recording.position.shape[1]}; the file has no names, so its order must be that of the specimen"
-            )
-        return recording
-    missing = [marker for marker in layout_names if marker not in recording.names]
-    present = [marker for marker in specimen.layout.names if marker in recording.names]
-    if len(present) < MIN_MARKERS:
-        raise InputError(
-            f"recording {name}: expected at least {MIN_MARKERS} of the specimen's markers, found "
-            f"{len(present)} (the file has {', '.join(recording.names[:6])}...); use the same names in both"
-        )
-    order = [recording.names.index(marker) if marker in recording.names else -1 for marker in layout_names]
-    position, sigma = recording.position[:, order].copy(), recording.sigma[:, order].copy()
-    position[:, [layout_names.index(marker) for marker in missing]] = np.nan
-    return Recording(
-        layout_names,
-        recording.time,
-        position,
-        sigma,
-        recording.rest,
-        recording.in_specimen_frame,
-        recording.source,
-    )
 
 
 def _check_same_layout(markers: Markers, known: Markers) -> None:
@@ -256,9 +234,9 @@ def _found_markers(
     distance = float(np.sqrt((moved**2).mean()))
     if distance > settings.fit_tolerance:
         raise InputError(
-            f"specimen {specimen.name}: expected the markers near their at_mm, found them {1e3 * distance:.2f} mm off in "
-            f"the first frames (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); check at_mm, that the "
-            "calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
+            f"specimen {specimen.name}: expected the markers near their at_mm, found them {1e3 * distance:.2f} mm off "
+            f"in the first frames (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); check at_mm, that "
+            "the calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
         )
     return markers
 

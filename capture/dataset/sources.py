@@ -1,12 +1,13 @@
-"""Readers of recorded marker positions: tracks, C3D and npy files."""
+"""Readers of recorded marker positions: tracks, C3D files, tables and npy files."""
 
 from pathlib import Path
 from typing import Any
 
-import ezc3d
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.capture.dataset.c3d import read_c3d
+from rafl.capture.dataset.marker_tables import METRES, read_marker_table
 from rafl.capture.registration.recording import Recording
 from rafl.common.errors import InputError
 from rafl.common.files import sha256
@@ -15,37 +16,36 @@ from rafl.tracking.reconstruction.tracks import read_tracks
 
 Array = NDArray[Any]
 
-SUFFIXES = (".h5", ".c3d", ".npy")
+# Ends of the names of a recording's files; an earlier one says more about it. DLTdv adds `xyzpts` to a name.
+ENDS = (".h5", ".csv", ".c3d", ".trc", ".tsv", "xyzpts.csv", ".npy")
 ASSUMED_SIGMA = 1e-4  # of files without uncertainties [m]
 MAX_COORDINATE = 10.0  # [m]; a larger coordinate shows that the file has another unit
 
 
-def find_source(folder: Path, recording: str) -> Path:
-    """The file of a recording.
+def find_sources(folder: Path, recording: str) -> list[Path]:
+    """The files of a recording; the first one says most about it.
 
     Raises:
-        InputError: no file, or more than one.
+        InputError: no file.
     """
     if not folder.is_dir():
         raise InputError(f"expected a folder of tracks at {folder}, found none; check the path")
-    found = [path for suffix in SUFFIXES if (path := folder / f"{recording}{suffix}").is_file()]
+    found = [path for end in ENDS if (path := folder / f"{recording}{end}").is_file()]
     if not found:
         raise InputError(
-            f"recording {recording}: expected {recording}.h5, .c3d or .npy in {folder}, found none; correct "
-            "the name in the recordings file, or track the video"
+            f"recording {recording}: expected {recording}.h5, .csv, .c3d, .trc, .tsv or .npy in {folder}, found none; "
+            "correct the name in the recordings file, or track the video"
         )
-    if len(found) > 1:
-        names = ", ".join(path.name for path in found)
-        raise InputError(f"recording {recording}: expected one file, found {names}; move one away")
-    return found[0]
+    return found
 
 
-def read_recording(path: Path, fps: float) -> Recording:
-    """Read a tracks file, a C3D file, or a q<i>.npy file of the paper's authors.
+def read_recording(path: Path, fps: float, unit: str | None = None) -> Recording:
+    """Read a tracks file, a C3D file, a table, or a q<i>.npy file of the paper's authors.
 
     Args:
         path: of the file.
-        fps: frames per second of npy files, which do not store it.
+        fps: frames per second of files that do not store it.
+        unit: of tables that do not name it: m, cm or mm.
 
     Raises:
         InputError: the file cannot be read, or has another shape.
@@ -55,27 +55,34 @@ def read_recording(path: Path, fps: float) -> Recording:
         tracks = read_tracks(path)
         position = np.where((tracks.state == MISSING)[..., None], np.nan, tracks.position)
         return Recording(tracks.names, tracks.time, position, tracks.sigma, None, True, source)
-    return _read_c3d(path, source) if path.suffix == ".c3d" else _read_npy(path, fps, source)
+    if path.suffix == ".c3d":
+        return _read_c3d(path, source)
+    return _read_npy(path, fps, source) if path.suffix == ".npy" else _read_table(path, fps, unit, source)
+
+
+def _read_table(path: Path, fps: float, unit: str | None, source: str) -> Recording:
+    table = read_marker_table(path)
+    name = (table.unit or unit or "").lower()
+    if name not in METRES:
+        found = f"found {table.unit!r}" if table.unit else "found none in the file"
+        raise InputError(f"{path}: expected a unit, m, cm or mm, {found}; give it with --unit")
+    position = METRES[name] * table.position
+    sigma = np.full_like(position, ASSUMED_SIGMA) if table.sigma is None else METRES[name] * table.sigma
+    time = np.arange(len(position)) / fps if table.time is None else table.time
+    return Recording(table.names, time, position, sigma, None, table.in_specimen_frame, source)
 
 
 def _read_c3d(path: Path, source: str) -> Recording:
-    try:
-        file = ezc3d.c3d(str(path))
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"expected a C3D file in {path}, which cannot be read: {error}; export it again") from None
-    group = file["parameters"]["POINT"]
-    names = tuple(str(name) for name in group["LABELS"]["value"])
-    unit = str(group["UNITS"]["value"][0]).strip() if group["UNITS"]["value"] else "mm"
-    scale = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}.get(unit)
+    content = read_c3d(path)
+    scale = METRES.get(content.unit.lower())
     if scale is None:
-        raise InputError(f"{path}: expected points in m, cm or mm, found {unit!r}; export in mm")
-    points = np.asarray(file["data"]["points"], dtype=float)[:3, : len(names)].transpose(2, 1, 0) * scale
-    residual = np.asarray(file["data"]["meta_points"]["residuals"], dtype=float)[0, : len(names)].T * scale
+        raise InputError(f"{path}: expected points in m, cm or mm, found {content.unit!r}; export in mm")
+    points, residual = content.points * scale, content.residuals * scale
     missing = (residual < 0) | (points == 0).all(axis=2) | ~np.isfinite(points).all(axis=2)
     position = np.where(missing[..., None], np.nan, points)
     sigma = np.where(residual > 0, residual, ASSUMED_SIGMA)[..., None].repeat(3, axis=2)
-    rate = float(group["RATE"]["value"][0])
-    return Recording(names, np.arange(len(points)) / rate, position, sigma, None, False, source)
+    time = np.arange(len(points)) / content.rate
+    return Recording(content.names, time, position, sigma, None, content.exported, source)
 
 
 def _read_npy(path: Path, fps: float, source: str) -> Recording:
@@ -93,4 +100,5 @@ def _read_npy(path: Path, fps: float, source: str) -> Recording:
         raise InputError(f"{path}: expected mm, found values up to {np.nanmax(np.abs(content)):g}; save it in mm")
     sigma = np.full_like(position[1:], ASSUMED_SIGMA)
     time = np.arange(len(position) - 1) / fps
-    return Recording(None, time, position[1:], sigma, position[0], False, source)
+    rest = position[0] if np.isfinite(position[0]).any() else None
+    return Recording(None, time, position[1:], sigma, rest, False, source)

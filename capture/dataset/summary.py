@@ -11,7 +11,6 @@ from rafl.common.command_line import create_table
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 
-
 MISPLACED_MM = 2.0  # farther from its description than a hand misplaces a dot: four usual standard deviations
 
 
@@ -48,8 +47,8 @@ def warnings(dataset: Dataset) -> list[str]:
     for name, distance in zip(dataset.markers.names, distances, strict=True):
         if distance > MISPLACED_MM:
             lines.append(
-                f"marker {name}: found {distance:.1f} mm from its at_mm in the first frames; correct at_mm, or its name "
-                "in the tracks"
+                f"marker {name}: found {distance:.1f} mm from its at_mm in the first frames; correct at_mm, or its "
+                "name in the tracks"
             )
     for name, item in dataset.trajectories.items():
         if outliers := item.attributes.get("set_aside"):

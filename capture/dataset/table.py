@@ -2,6 +2,7 @@
 
 import csv
 import io
+import re
 from collections import Counter
 from pathlib import Path
 from typing import Literal
@@ -28,8 +29,8 @@ class RecordingRow(StrictModel):
     last_frame: int | None = pydantic.Field(None, ge=1)
 
 
-def read_recording_rows(path: Path, complete: bool = True) -> list[RecordingRow]:
-    """Read recordings.csv; a `complete` table must have recordings to train on.
+def read_recording_rows(path: Path) -> list[RecordingRow]:
+    """Read recordings.csv.
 
     Cells are separated by commas, semicolons or tabs, as spreadsheets of different countries save them. Unless commas
     separate the cells, a comma in a number is a decimal comma.
@@ -40,9 +41,12 @@ def read_recording_rows(path: Path, complete: bool = True) -> list[RecordingRow]
     require_file(path, "a table of recordings (recordings.csv)")
     try:
         text = path.read_text(encoding="utf-8-sig")
-        separator = max(",;\t", key=text.partition("\n")[0].count)
+        named = re.match(r"\"?sep=(?P<separator>[,;\t])\"?\r?\n", text)  # a line for spreadsheets
+        text = text[named.end() :] if named else text
+        separator = named["separator"] if named else max(",;\t", key=text.partition("\n")[0].count)
         table = csv.DictReader(io.StringIO(text), delimiter=separator, skipinitialspace=True)
-        records = [(table.line_num, record) for record in table]
+        skipped = 1 if named else 0
+        records = [(table.line_num + skipped, record) for record in table]
     except (csv.Error, UnicodeDecodeError) as error:
         raise InputError(f"expected a table in {path}, found: {error}; save it as CSV UTF-8") from None
     if not table.fieldnames:
@@ -71,6 +75,4 @@ def read_recording_rows(path: Path, complete: bool = True) -> list[RecordingRow]
     repeated = [name for name, count in Counter(row.recording for row in rows).items() if count > 1]
     if repeated:
         raise InputError(f"{path}: expected each recording once, found {repeated[0]} twice; remove one row")
-    if complete and not any(row.split == "train" for row in rows):
-        raise InputError(f"{path}: expected a recording with split `train`, found none; set one")
     return rows

@@ -64,14 +64,20 @@ def _second_differences(position: Array) -> Array:
 
 
 def _sustained_change(change: Array) -> Array:
-    """Median over each frame and those after it (T), so that single wrong frames do not count."""
-    padded = np.append(np.nan_to_num(change), np.zeros(MEDIAN_WINDOW_FRAMES - 1))
+    """Median over each frame and those after it (T), so that single wrong frames do not count.
+
+    After the end the specimen is taken to rest. Frames without markers do not count.
+    """
+    padded = np.append(change[:-1], np.zeros(MEDIAN_WINDOW_FRAMES))
     windows = np.lib.stride_tricks.sliding_window_view(padded, MEDIAN_WINDOW_FRAMES)
-    return np.asarray(np.median(windows, axis=1))
+    known = np.isfinite(windows).any(axis=1)
+    median = np.zeros(len(windows))
+    median[known] = np.nanmedian(windows[known], axis=1)
+    return median
 
 
 def _rest_start(position: Array, start: int, change: Array) -> int:
-    """First frame from which on the markers stay, within noise, at their positions just before `start`."""
+    """First frame from which on the markers are seen and stay, within noise, at their positions just before `start`."""
     quiet = change[1 : max(start - 1, 1)]
     if not np.isfinite(quiet).any():
         return start
@@ -84,7 +90,7 @@ def _rest_start(position: Array, start: int, change: Array) -> int:
     for frame in range(start - 1, max(start - MAX_REST_FRAMES, 0) - 1, -1):
         distance = np.linalg.norm(position[frame] - rest, axis=1)
         distance = distance[np.isfinite(distance)]
-        if len(distance) and np.sqrt((distance**2).mean()) > REST_NOISE_FACTOR * noise:
+        if not len(distance) or np.sqrt((distance**2).mean()) > REST_NOISE_FACTOR * noise:
             break
         first = frame
     return first

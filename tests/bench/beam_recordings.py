@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rafl.capture.dataset.sources import find_source, read_recording
+from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import read_recording_rows
 from rafl.capture.registration.initial import FirstFrame, fit_first_frame, fit_velocity
 from rafl.capture.registration.registration import RestPose, combined_layout, fit_rest
@@ -81,7 +81,7 @@ class BeamRecording:
 def read_beam(specimen: Specimen, folder: Path, table: Path) -> tuple[Specimen, list[BeamRecording]]:
     """The specimen with its markers where they were when the beam was held straight, and its recordings."""
     rows = read_recording_rows(table)
-    files = {row.recording: read_recording(find_source(folder, row.recording), 100.0) for row in rows}
+    files = {row.recording: read_recording(find_sources(folder, row.recording)[0], 100.0) for row in rows}
     names, _ = combined_layout(specimen)
     own = len(specimen.layout.names)
     pose = fit_rest(files[STRAIGHT.recording], STRAIGHT, specimen, LAYOUT_TOLERANCE).fit.transform

@@ -1,14 +1,19 @@
 """Export of tracks to other programs' formats: CSV, C3D, TRC and NumPy."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import ezc3d
 import numpy as np
+from numpy.typing import NDArray
 
 from rafl.common.files import atomic_file, write_text
 from rafl.tracking.reconstruction.gap_filling import FILLED, MISSING
 from rafl.tracking.reconstruction.tracks import Tracks
+
+Places = Mapping[str, NDArray[np.float64]]  # of markers on the undeformed body [m], (3), by name
+Writer = Callable[[Path, Tracks, Places], None]
+SPECIMEN_FRAME = "(specimen frame)"  # at the end of a TRC file's first line: the positions need no registration
 
 
 def write_csv(path: Path, tracks: Tracks) -> None:
@@ -29,6 +34,7 @@ def write_c3d(path: Path, tracks: Tracks) -> None:
     parameters["RATE"]["value"] = [tracks.fps]
     parameters["LABELS"]["value"] = list(tracks.names)
     parameters["UNITS"]["value"] = ["mm"]
+    file.add_parameter("RAFL", "FRAME", ["specimen"])  # tells rafl-capture that the positions need no registration
     file["data"]["points"] = points
     file["data"]["meta_points"]["residuals"] = residual.T[None]
     file["data"]["meta_points"]["camera_masks"] = np.zeros((7, len(tracks.names), len(tracks.time)), dtype=bool)
@@ -41,7 +47,7 @@ def write_trc(path: Path, tracks: Tracks) -> None:
     rate, frames, markers = f"{tracks.fps:.6g}", len(tracks.time), len(tracks.names)
     keys = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
     lines = [
-        f"PathFileType\t4\t(X/Y/Z)\t{path.name}",
+        f"PathFileType\t4\t(X/Y/Z)\t{path.name} {SPECIMEN_FRAME}",
         keys.replace(" ", "\t"),
         "\t".join([rate, rate, str(frames), str(markers), "mm", rate, "1", str(frames)]),
         "Frame#\tTime\t" + "\t\t\t".join(tracks.names) + "\t\t",
@@ -54,16 +60,24 @@ def write_trc(path: Path, tracks: Tracks) -> None:
     write_text(path, "\n".join(lines) + "\n")
 
 
-def write_npy(path: Path, tracks: Tracks) -> None:
-    """Write the paper authors' array (T, M, 3), in mm, NaN where missing."""
+def write_npy(path: Path, tracks: Tracks, places: Places) -> None:
+    """Write the paper authors' array (1 + T, M, 3), in mm, NaN where missing.
+
+    Row 0 has the places of the markers on the undeformed body, NaN where they are not known.
+    """
+    rest = np.array([places.get(name, np.full(3, np.nan)) for name in tracks.names]).reshape(1, -1, 3)
     with atomic_file(path) as temporary, temporary.open("wb") as stream:
-        np.save(stream, 1e3 * tracks.position)
+        np.save(stream, 1e3 * np.concatenate([rest, tracks.position]))
 
 
-WRITERS: dict[str, Callable[[Path, Tracks], None]] = {
-    "csv": write_csv,
-    "c3d": write_c3d,
-    "trc": write_trc,
+def _without_places(write: Callable[[Path, Tracks], None]) -> Writer:
+    return lambda path, tracks, places: write(path, tracks)
+
+
+WRITERS: dict[str, Writer] = {
+    "csv": _without_places(write_csv),
+    "c3d": _without_places(write_c3d),
+    "trc": _without_places(write_trc),
     "npy": write_npy,
 }
 

@@ -18,7 +18,8 @@ from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset, update_dataset, write_dataset
 from rafl.data.synthetic import load_force
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
+from rafl.tracking.reconstruction.export import WRITERS, export_name
+from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
 
 SETTINGS = CaptureSettings()
 FRAMES = 8
@@ -244,7 +245,7 @@ def test_invalid_files_and_frames_are_refused(small_specimen: Specimen, truth: n
     with pytest.raises(InputError, match="cannot be read"):
         build(small_specimen, tmp_path)
     path.unlink()
-    with pytest.raises(InputError, match=r"q0\.h5, \.c3d or \.npy"):
+    with pytest.raises(InputError, match=r"q0\.h5, \.csv, \.c3d, \.trc, \.tsv or \.npy"):
         build(small_specimen, tmp_path)
 
 
@@ -255,7 +256,6 @@ def test_invalid_files_and_frames_are_refused(small_specimen: Specimen, truth: n
         ("recording,load_g,split\na,50,train\nb,heavy,test\n", "line 3, column load_g"),
         ("recording,load,split\na,50,train\n", "line 2"),
         ("recording,load_g,split\n", "at least one recording"),
-        ("recording,load_g,split\na,50,test\n", "split `train`"),
         ("recording,load_g,split\n\na,50,train\n,,\nb,heavy,test\n", "line 5, column load_g"),
         ("recording,load_g,split\na,60,5,train\n", "line 2: expected 3 cells"),
         ('recording,load_g,split\na,"1,234",train\n', "line 2, column load_g"),  # ambiguous: a thousand, or one
@@ -326,3 +326,41 @@ def test_a_dot_far_from_its_description_is_found_and_named(
     assert read_dataset(tmp_path / "small.h5").split("val") == ["q0"]
     with pytest.raises(InputError, match="without --update"):
         build_dataset(small_specimen, tmp_path, rows, SETTINGS, "", lambda: None, again)
+
+
+def places_of(specimen: Specimen) -> dict[str, np.ndarray]:
+    return dict(zip(specimen.layout.names, specimen.layout.positions, strict=True))
+
+
+@pytest.mark.parametrize("kind", ["csv", "c3d", "trc", "npy"])
+def test_exports_are_read_back(kind: str, small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    """Every export gives the positions of the tracks, in the specimen frame, without any option."""
+    write_q0_tracks(small_specimen, tmp_path, truth[1:], np.full_like(truth[1:], 1e-5))
+    tracks = read_tracks(tmp_path / "q0.h5")
+    own = build(small_specimen, tmp_path).trajectories["q0"]
+    (tmp_path / "q0.h5").unlink()
+    WRITERS[kind](tmp_path / export_name(kind, "q0", 0), tracks, places_of(small_specimen))
+    read = build(small_specimen, tmp_path).trajectories["q0"]
+    np.testing.assert_allclose(read.markers, own.markers, atol=1e-7)
+    np.testing.assert_allclose(read.time, own.time)
+    np.testing.assert_allclose(read.q, own.q, atol=3e-5)
+
+
+def test_the_richest_file_of_a_recording_is_read(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    write_q0_tracks(small_specimen, tmp_path, truth[1:], np.full_like(truth[1:], 1e-5))
+    for kind in WRITERS:
+        path = tmp_path / export_name(kind, "q0", 0)
+        WRITERS[kind](path, read_tracks(tmp_path / "q0.h5"), places_of(small_specimen))
+    source = str(build(small_specimen, tmp_path).trajectories["q0"].attributes["source"])
+    assert source.startswith("q0.h5 ")
+    assert source.endswith("beside it, not read: q0.csv, q0.c3d, q0.trc, q0.npy")
+
+
+def test_a_dataset_of_test_recordings_alone(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
+    """A shape that nobody trains on; a line for spreadsheets before the table is skipped."""
+    write_q0_tracks(small_specimen, tmp_path, truth[1:], np.full_like(truth[1:], 1e-5))
+    (tmp_path / "recordings.csv").write_text("\ufeffsep=;\r\nrecording;load_g;split\r\nq0;60,5;test\r\n")
+    rows = read_recording_rows(tmp_path / "recordings.csv")
+    assert [(row.recording, row.load_g, row.split) for row in rows] == [("q0", 60.5, "test")]
+    built = build_dataset(small_specimen, tmp_path, rows, SETTINGS, "", lambda: None)
+    assert built.split("test") == ["q0"]

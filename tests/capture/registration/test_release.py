@@ -73,3 +73,16 @@ def test_single_wrong_frames_are_not_a_release(motion: np.ndarray) -> None:
 def test_recordings_without_motion_or_markers_start_at_frame_0() -> None:
     assert find_release(np.full((9, 4, 3), np.nan)).start == 0
     assert find_release(np.zeros((9, 4, 3))).start == 0
+
+
+def test_missing_frames_are_not_rest(motion: np.ndarray) -> None:
+    """All markers are lost in frames 4 to 11, after a release at frame 0."""
+    position = motion[::SUBFRAMES].copy()
+    position[4:12] = np.nan
+    assert find_release(position) == Release(0, 0)
+
+
+def test_the_rest_begins_after_missing_frames(motion: np.ndarray) -> None:
+    position = released(motion, 0)
+    position[20:25] = np.nan
+    assert find_release(position) == Release(REST_FRAMES - 1, 25)

@@ -59,5 +59,9 @@ def test_trc(tracks: Tracks, tmp_path: Path) -> None:
 
 
 def test_npy(tracks: Tracks, tmp_path: Path) -> None:
-    write_npy(tmp_path / "q0.npy", tracks)
-    np.testing.assert_array_equal(np.load(tmp_path / "q0.npy", allow_pickle=False), 1e3 * tracks.position)
+    """Row 0 has the places of the markers at rest, as far as they are known."""
+    places = {"tip": np.array([0.1, 0.0, 0.02]), "L1": np.array([0.01, 0.0, 0.02])}
+    write_npy(tmp_path / "q0.npy", tracks, places)
+    written = np.load(tmp_path / "q0.npy", allow_pickle=False)
+    np.testing.assert_array_equal(written[1:], 1e3 * tracks.position)
+    np.testing.assert_allclose(written[0], [[10.0, 0.0, 20.0], [np.nan] * 3, [100.0, 0.0, 20.0]])
