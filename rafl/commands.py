@@ -82,7 +82,8 @@ def fit(
         for line in selection_sentences(pd.read_csv(run / SELECTION_FILE), model):
             typer.echo(line)
     if (run / "parameters.csv").exists():
-        for line in parameter_sentences(pd.read_csv(run / "parameters.csv")):
+        through_model = any(read_dataset(path).registered_through_model for path in paths)
+        for line in parameter_sentences(pd.read_csv(run / "parameters.csv"), through_model):
             typer.echo(line)
     typer.echo(f"wrote {run}/ (model.pt, history.csv, config.yaml)")
     typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in paths)}")

@@ -50,6 +50,11 @@ def warnings(dataset: Dataset) -> list[str]:
                 f"marker {name}: found {distance:.1f} mm from its at_mm in the first frames; correct at_mm, or its "
                 "name in the tracks"
             )
+    if names := dataset.registered_through_model:
+        lines.append(
+            f"recordings {', '.join(names)}: their frame was found through the assumed material, and a fit will return "
+            "about that material; film the undeformed specimen (--rest), or put three markers on the clamp"
+        )
     for name, item in dataset.trajectories.items():
         if outliers := item.attributes.get("set_aside"):
             lines.append(

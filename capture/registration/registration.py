@@ -18,6 +18,7 @@ from rafl.capture.registration.rigid import (
 )
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
+from rafl.data.dataset import THROUGH_MODEL
 
 Array = NDArray[Any]
 
@@ -182,7 +183,7 @@ def register(
         return Registration(method, fit.transform, residual, outliers, fit.covariance)
     if recording.in_specimen_frame:
         return Registration("calibration", IDENTITY, {})
-    return Registration("through the model, from the markers near the clamp", IDENTITY, {}, pose_from_model=True)
+    return Registration(f"{THROUGH_MODEL}, from the markers near the clamp", IDENTITY, {}, pose_from_model=True)
 
 
 def fit_pose_near_clamp(specimen: Specimen, target: Array) -> RigidTransform:

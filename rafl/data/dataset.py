@@ -14,6 +14,7 @@ from rafl.simulation.simulator import Simulator
 Array = NDArray[Any]
 
 SPLITS = ("train", "val", "test")
+THROUGH_MODEL = "through the model"  # begins the description of a registration that rests on the assumed material
 # Largest relative error of frame times against an even time grid, and of one recording's time step against another's.
 MAX_RELATIVE_TIME_ERROR = 5e-3
 
@@ -75,6 +76,12 @@ class Dataset:
     def split(self, name: str) -> list[str]:
         """Names of the recordings of a split, in order."""
         return [key for key, item in self.trajectories.items() if item.split == name]
+
+    @property
+    def registered_through_model(self) -> list[str]:
+        """Names of the recordings whose frame was found through the assumed material."""
+        found = {name: str(item.attributes.get("registration", "")) for name, item in self.trajectories.items()}
+        return [name for name, method in found.items() if method.startswith(THROUGH_MODEL)]
 
     def start(self, recordings: list[str]) -> Start:
         """Initial states and loads of the named recordings as one batch."""

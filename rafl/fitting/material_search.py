@@ -102,6 +102,8 @@ class MaterialSearch:
         self.training = batches_by_dataset(training_items(used), settings.by_sigma)
         self.validation = validation_batches(used)
         self.quantities, self.settings, self.history = quantities, settings, history
+        # A frame that was found through the assumed material moves with it, which the recordings' loss does not show.
+        self.intervals_known = not any(dataset.registered_through_model for dataset in used)
         self.prior = prior or Prior.flat(len(quantities))
         self.simulator = used[0].simulator
         self.frames = 0  # number of frames to simulate
@@ -266,7 +268,10 @@ class MaterialSearch:
         return np.flatnonzero((lows + margin < x) & (x < highs - margin))
 
     def covariance(self, minimum: Minimum) -> Array:
-        """Covariance of the variables, (n, n); NaN where a variable is at its bound, and where the search ended early.
+        """Covariance of the variables, (n, n).
+
+        NaN where a variable is at its bound, where the search ended early, and where the recordings' frame was found
+        through the assumed material.
 
         Marker errors are assumed independent and as large as the residuals of the fit; the Gauss-Newton matrix then
         gives the information matrix.
@@ -276,7 +281,11 @@ class MaterialSearch:
         found = self.evaluate(minimum.x)
         matrix = (minimum.curvature + found.loss * np.diag(self.prior.curvature))[np.ix_(inside, inside)]
         gradient = (found.gradient + found.loss * self.prior.slope(minimum.x))[inside]
-        if len(inside) and np.linalg.eigvalsh(matrix)[0] > MIN_RELATIVE_CURVATURE * np.trace(matrix):
+        if (
+            self.intervals_known
+            and len(inside)
+            and np.linalg.eigvalsh(matrix)[0] > MIN_RELATIVE_CURVATURE * np.trace(matrix)
+        ):
             inverse = np.linalg.inv(matrix)
             if gradient @ inverse @ gradient <= 2.0 * EXACT * found.loss:
                 freedom = max(self.observed - len(minimum.x), 1.0)

@@ -119,8 +119,13 @@ def _save(search: MaterialSearch, minimum: Minimum, run: Path) -> FittedModel:
     return model
 
 
-def parameter_sentences(table: pd.DataFrame) -> list[str]:
-    """Sentences about the identified parameters, learned weights left out; `table` is `parameters.csv` as read."""
+def parameter_sentences(table: pd.DataFrame, through_model: bool = False) -> list[str]:
+    """Sentences about the identified parameters, learned weights left out.
+
+    Args:
+        table: `parameters.csv` as read.
+        through_model: whether the frame of some recordings was found through the assumed material.
+    """
     learned = [quantity.name for quantity in METHOD_QUANTITIES["constitutive"] if quantity.learned]
     table = table[~table["name"].isin(learned)].reset_index(drop=True)
     lines = []
@@ -131,7 +136,12 @@ def parameter_sentences(table: pd.DataFrame) -> list[str]:
         if not np.isfinite(row["low_95"]):
             interval = "no interval: the value is at its bound"
         lines.append(f"{row['name']} = {row['value']:.5g}{unit} ({interval})")
-    if not found:
+    if through_model:
+        lines.append(
+            "no 95 % intervals: the frame of the recordings was found through the assumed material, and E follows it; "
+            "film the undeformed specimen (rafl-capture --rest), or put three markers on the clamp"
+        )
+    elif not found:
         lines.append(
             "no 95 % intervals: the search ended near a minimum but not at it; rafl-fit --method sysid-branches "
             "searches on"

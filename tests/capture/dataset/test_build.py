@@ -121,8 +121,11 @@ def test_without_a_rest_pose_the_pose_is_fitted_with_the_model(
 ) -> None:
     """The first frame is bent by 60 g, and the pose of the lab frame is unknown."""
     write_c3d(tmp_path / "q0.c3d", list(small_specimen.layout.names), in_lab_frame(truth[1:]))
-    item = build(small_specimen, tmp_path).trajectories["q0"]
+    built = build(small_specimen, tmp_path)
+    item = built.trajectories["q0"]
     assert str(item.attributes["registration"]).startswith("through the model")
+    assert built.registered_through_model == ["q0"]
+    assert "film the undeformed specimen (--rest)" in warnings(built)[0]
     assert np.abs(item.markers - truth[1:]).max() < 5e-4
     assert item.attributes["fit_residual_mm"] < 0.05
 

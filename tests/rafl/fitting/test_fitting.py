@@ -283,6 +283,18 @@ def test_identification_with_an_initial_loss_of_zero(dataset: Dataset, tmp_path:
     assert mean_error(validation_batches([exact]), model) < 1e-9
 
 
+def test_no_interval_where_the_frame_was_found_through_the_model(dataset: Dataset, tmp_path: Path) -> None:
+    """The recordings' frame follows the assumed material, which their loss does not show."""
+    through = {"registration": "through the model, from the markers near the clamp"}
+    items = {name: replace(item, attributes=through) for name, item in dataset.trajectories.items()}
+    settings = replace(SETTINGS, method="sysid-e", epochs=12, frames=0)
+    identify_material([replace(dataset, trajectories=items)], settings, tmp_path, ignore)
+    table = pd.read_csv(tmp_path / "parameters.csv")
+    assert table[["low_95", "high_95"]].isna().all(axis=None)
+    (line,) = parameter_sentences(table, through_model=True)
+    assert "--rest" in line
+
+
 def test_correlated_parameters_are_reported() -> None:
     table = pd.DataFrame(
         {
