@@ -16,6 +16,7 @@ import matplotlib.pyplot as plt
 DOCS = Path(__file__).parent
 RESULTS = DOCS.parent / "datasets" / "results"
 FIGURES = DOCS / "figures"
+SMALLEST_ERROR_SHOWN = 0.01  # [mm]
 matplotlib.rcParams["svg.hashsalt"] = "rafl"  # the same file from the same data
 
 
@@ -53,6 +54,8 @@ def _with_equations(text: str) -> str:
 def _table(name: str) -> str:
     """A results file as a table with one column per method."""
     table = pd.read_csv(RESULTS / name, comment="#")
+    if "trained_on" in table:
+        return str(table.drop(columns="method").round(3).to_markdown(index=False))
     rows = "recording" if "recording" in table else "shape" if "shape" in table else "dataset"
     keys = [rows] if "study" not in table else ["study", rows]
     wide = table.pivot_table(index=keys, columns="method", values="mean_mm", sort=False)
@@ -75,6 +78,7 @@ def _bars(table: pd.DataFrame) -> plt.Figure:
         axes.bar(at, own["mean_mm"], width, label=method)
         axes.plot(at, own["paper_mean_mm"], "kx", markersize=5, label="paper" if k == 0 else None)
     axes.set_yscale("log")
+    axes.set_ylim(bottom=SMALLEST_ERROR_SHOWN)
     axes.set_xticks(range(len(shapes)), shapes, rotation=30, ha="right")
     axes.set_ylabel("error [mm]")
     axes.legend(ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.0), frameon=False)
