@@ -232,7 +232,7 @@ def _found_markers(
         for item, frame in zip(registered, frames, strict=True)
     ]
     prior_sigma = np.broadcast_to(specimen.layout.sigma, len(dataset.markers.names))
-    markers = find_places(frames, poses, prior_sigma).markers
+    markers = find_places(frames, poses, prior_sigma)
     moved = np.linalg.norm(markers.rest - dataset.markers.rest, axis=1)
     distance = float(np.sqrt((moved**2).mean()))
     if distance > settings.fit_tolerance:

@@ -22,7 +22,7 @@ Array = NDArray[Any]
 BLOCK_BYTES, MARK, INTEL = 512, 0x50, 84  # bytes of a block; the second byte; the processor of our byte order
 MANY_FRAMES = 65535  # last frame in the header of a file with more
 TIMEOUT = 120.0  # [s]
-MAX_MEMORY_BYTES, BYTES_PER_BYTE = 2_000_000_000, 40  # for the library, and for each byte of the file
+MAX_MEMORY_BYTES, MEMORY_PER_BYTE = 2_000_000_000, 40  # for the library, and for each byte of the file
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def _extract(source: Path, out: Path) -> None:
     """Read a file by the library and write what is needed of it as arrays."""
     import ezc3d
 
-    limit = MAX_MEMORY_BYTES + BYTES_PER_BYTE * source.stat().st_size
+    limit = MAX_MEMORY_BYTES + MEMORY_PER_BYTE * source.stat().st_size
     resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
     file = ezc3d.c3d(str(source))
     group = file["parameters"]["POINT"]

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.common.errors import InputError
+from rafl.common.text_tables import read_table_text
 from rafl.tracking.reconstruction.export import SPECIMEN_FRAME
 
 Array = NDArray[Any]
@@ -65,12 +66,8 @@ def read_marker_table(path: Path) -> MarkerTable:
     """
     if path.stat().st_size > MAX_TABLE_BYTES:
         raise InputError(f"{path}: expected a table of at most {MAX_TABLE_BYTES / 1e9:g} GB; export it as C3D")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"expected a table in {path}, found no text; export it as CSV or C3D") from None
+    text, separator, _ = read_table_text(path)
     first = text.partition("\n")[0]
-    separator = max(",;\t", key=first.count)
     if path.suffix.lower() in (".tsv", ".trc"):
         separator = "\t"
     try:

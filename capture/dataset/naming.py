@@ -12,6 +12,7 @@ from rafl.capture.registration.rigid import MIN_MARKERS
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
+from rafl.common.text_tables import read_table_text
 
 WRONG_UNIT = 4.0  # times too large or small: units differ by 10 or more, bending changes distances by less than this
 
@@ -23,11 +24,7 @@ def read_marker_names(path: Path) -> dict[str, str]:
         InputError: no such file, no such table, or a name twice.
     """
     require_file(path, "a table of marker names")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"expected a table in {path}, found no text; save it as CSV UTF-8") from None
-    separator = max(",;\t", key=text.partition("\n")[0].count)
+    text, separator, _ = read_table_text(path)
     rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator) if any(row)]
     if not rows or rows[0] != ["file", "specimen"] or any(len(row) != 2 for row in rows):
         raise InputError(f"{path}: expected a table with the columns file,specimen; found other ones")

@@ -52,8 +52,8 @@ def warnings(dataset: Dataset) -> list[str]:
             )
     if names := dataset.registered_through_model:
         lines.append(
-            f"recordings {', '.join(names)}: their frame was found through the assumed material, and a fit will return "
-            "about that material; film the undeformed specimen (--rest), or put three markers on the clamp"
+            f"recordings {', '.join(names)}: their frame was found through the assumed material, which a fitted "
+            "material then depends on; film the undeformed specimen (--rest), or put three markers on the clamp"
         )
     for name, item in dataset.trajectories.items():
         if outliers := item.attributes.get("set_aside"):

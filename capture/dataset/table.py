@@ -2,7 +2,6 @@
 
 import csv
 import io
-import re
 from collections import Counter
 from pathlib import Path
 from typing import Literal
@@ -11,6 +10,7 @@ import pydantic
 
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
+from rafl.common.text_tables import read_table_text
 from rafl.common.yaml_files import StrictModel
 
 
@@ -39,15 +39,11 @@ def read_recording_rows(path: Path) -> list[RecordingRow]:
         InputError: the file is missing or no table, or a row is invalid; the message names the line.
     """
     require_file(path, "a table of recordings (recordings.csv)")
+    text, separator, skipped = read_table_text(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
-        named = re.match(r"\"?sep=(?P<separator>[,;\t])\"?\r?\n", text)  # a line for spreadsheets
-        text = text[named.end() :] if named else text
-        separator = named["separator"] if named else max(",;\t", key=text.partition("\n")[0].count)
         table = csv.DictReader(io.StringIO(text), delimiter=separator, skipinitialspace=True)
-        skipped = 1 if named else 0
         records = [(table.line_num + skipped, record) for record in table]
-    except (csv.Error, UnicodeDecodeError) as error:
+    except csv.Error as error:
         raise InputError(f"expected a table in {path}, found: {error}; save it as CSV UTF-8") from None
     if not table.fieldnames:
         raise InputError(f"expected a table in {path}, found an empty file; save it as CSV UTF-8")

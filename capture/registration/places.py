@@ -1,6 +1,6 @@
 """Places of the markers on the undeformed body, found from the first frames of all recordings together."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,23 +23,8 @@ STEP_TOLERANCE = 1e-6  # [m]; the search ends with a smaller change of every pla
 MODEL_FRACTION, MIN_MODEL_SIGMA = 0.01, 1e-5
 
 
-@dataclass(frozen=True)
-class Places:
-    """Where the markers are on the undeformed body.
-
-    Attributes:
-        markers: embedded at the places found.
-        youngs_modulus: with which the first frames agree best [Pa]; only the shapes under gravity tell it.
-        modulus_sigma: standard deviation of its logarithm.
-    """
-
-    markers: Markers
-    youngs_modulus: float
-    modulus_sigma: float
-
-
-def find_places(frames: list[FirstFrame], poses: list[RigidTransform | None], prior_sigma: Array) -> Places:
-    """Find the places from the first frames of several recordings of one specimen.
+def find_places(frames: list[FirstFrame], poses: list[RigidTransform | None], prior_sigma: Array) -> Markers:
+    """The markers at the places that the first frames of several recordings of one specimen show.
 
     A marker's place is the same in all recordings, while forces and poses differ. Gauss-Newton minimises over places,
     log E, and for every recording the virtual forces that vary linearly over their nodes, and the pose where it is
@@ -88,9 +73,7 @@ def find_places(frames: list[FirstFrame], poses: list[RigidTransform | None], pr
             break
     covariance = np.linalg.inv(hessian)
     sigma = np.sqrt(np.diag(covariance))
-    markers = replace(markers, moved=moved, place_sigma=sigma[1:].reshape(-1, 3))
-    modulus = simulator.material.youngs_modulus * float(np.exp(log_modulus))
-    return Places(markers, modulus, float(sigma[0]))
+    return replace(markers, moved=moved, place_sigma=sigma[1:].reshape(-1, 3))
 
 
 def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, with_pose: bool) -> tuple[Array, Array]:

@@ -9,9 +9,6 @@ import yaml
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 
-# Names of the kinds of an entry where a list has several; pydantic puts them between an entry's number and its key.
-UNION_TAGS = ("marker", "grid")
-
 Model = TypeVar("Model", bound=pydantic.BaseModel)
 
 
@@ -39,7 +36,8 @@ def read_yaml(path: Path, model: type[Model], label: str, version: str) -> Model
         return model.model_validate(content)
     except pydantic.ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if part not in UNION_TAGS) or "the file"
+        # Where a list has entries of several kinds, the kind follows an entry's number: a tag in angle brackets.
+        key = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<")) or "the file"
         found = "" if first["type"] == "missing" else f", found {first['input']!r:.80}"
         others = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         message = first["msg"].removeprefix("Value error, ")

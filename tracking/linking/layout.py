@@ -71,10 +71,10 @@ def _check_unique_names(markers: list[MarkerEntry | MarkerGrid]) -> list[MarkerE
 
 
 def _kind(value: object) -> str:
-    return "grid" if isinstance(value, MarkerGrid) or (isinstance(value, dict) and "rows" in value) else "marker"
+    return "<grid>" if isinstance(value, MarkerGrid) or (isinstance(value, dict) and "rows" in value) else "<marker>"
 
 
-_Item = Annotated[Annotated[MarkerEntry, Tag("marker")] | Annotated[MarkerGrid, Tag("grid")], Discriminator(_kind)]
+_Item = Annotated[Annotated[MarkerEntry, Tag("<marker>")] | Annotated[MarkerGrid, Tag("<grid>")], Discriminator(_kind)]
 MarkerList = Annotated[list[_Item], AfterValidator(_check_unique_names)]
 
 

@@ -8,10 +8,10 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rafl.capture.registration.initial import FirstFrame
-from rafl.capture.registration.places import Places, find_places
+from rafl.capture.registration.places import find_places
 from rafl.capture.registration.registration import fit_pose_near_clamp
 from rafl.capture.specimen.specimen import Specimen
-from rafl.data.markers import embed
+from rafl.data.markers import Markers, embed
 from rafl.data.synthetic import loaded_equilibria, with_material
 
 LOADS = np.array([0.02, 0.05, 0.08, 0.11])
@@ -42,7 +42,7 @@ def first_frames(specimen: Specimen, offset: np.ndarray, stiffness: float = 1.0)
     return frames
 
 
-def find(specimen: Specimen, frames: list[FirstFrame], prior_sigma: float = 0.5e-3, with_pose: bool = False) -> Places:
+def find(specimen: Specimen, frames: list[FirstFrame], prior_sigma: float = 0.5e-3, with_pose: bool = False) -> Markers:
     poses = [fit_pose_near_clamp(specimen, frame.target) if with_pose else None for frame in frames]
     return find_places(frames, poses, np.full(len(frames[0].target), prior_sigma))
 
@@ -50,7 +50,7 @@ def find(specimen: Specimen, frames: list[FirstFrame], prior_sigma: float = 0.5e
 @pytest.mark.parametrize("stiffness", [1.0, 1.4])
 def test_places_are_found_to_a_twentieth_of_a_millimetre(small_specimen: Specimen, stiffness: float) -> None:
     offset = misplacement(small_specimen)
-    found = find(small_specimen, first_frames(small_specimen, offset, stiffness)).markers
+    found = find(small_specimen, first_frames(small_specimen, offset, stiffness))
     assert found.moved is not None
     assert found.place_sigma is not None
     error = found.moved - offset
@@ -68,7 +68,7 @@ def test_places_and_poses_are_found_together(small_specimen: Specimen) -> None:
         replace(frame, target=frame.target @ turn.T + np.array([0.003, -0.002, 0.004]))
         for frame in first_frames(small_specimen, offset)
     ]
-    found = find(small_specimen, frames, with_pose=True).markers
+    found = find(small_specimen, frames, with_pose=True)
     assert found.moved is not None
     sides = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (found.rest, found.rest - found.moved + offset)]
     described = np.linalg.norm(found.rest[:, None] - found.moved[:, None] - found.rest + found.moved, axis=-1)
@@ -77,7 +77,7 @@ def test_places_and_poses_are_found_together(small_specimen: Specimen) -> None:
 
 
 def test_places_that_are_exactly_known_stay(small_specimen: Specimen) -> None:
-    found = find(small_specimen, first_frames(small_specimen, misplacement(small_specimen)), prior_sigma=0.0).markers
+    found = find(small_specimen, first_frames(small_specimen, misplacement(small_specimen)), prior_sigma=0.0)
     assert found.moved is not None
     assert np.abs(found.moved).max() < 1e-8
 
@@ -86,7 +86,7 @@ def test_a_missing_marker_stays_with_its_prior(small_specimen: Specimen) -> None
     frames = first_frames(small_specimen, misplacement(small_specimen))
     for frame in frames:
         frame.target[4] = np.nan
-    found = find(small_specimen, frames).markers
+    found = find(small_specimen, frames)
     assert found.moved is not None
     assert found.place_sigma is not None
     np.testing.assert_allclose(found.moved[4], 0.0, atol=1e-9)
