@@ -13,7 +13,7 @@ from rafl.capture.dataset.naming import in_layout_order
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.initial import FirstFrame, InitialState, fit_first_frame, fit_velocity
-from rafl.capture.registration.places import find_places
+from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import (
     Registration,
@@ -24,7 +24,7 @@ from rafl.capture.registration.registration import (
     register,
 )
 from rafl.capture.registration.release import Release, find_release
-from rafl.capture.registration.rigid import MIN_MARKERS
+from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, pose_sigma
 from rafl.capture.registration.sequence import fit_by_sequence
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
@@ -117,7 +117,7 @@ def build_dataset(
         recording = recordings[row.recording]
         registration = register(recording, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
         registered.append(_Registered.of(specimen, recording, row, registration, settings))
-    markers = known or _found_markers(empty, specimen, registered, settings)
+    markers, registered = _find_places(empty, specimen, registered, known, settings)
     empty = replace(empty, markers=markers)
     trajectories = {}
     for item in registered:
@@ -198,6 +198,21 @@ class _Registered:
             )
         return cls(recording, row, registration, position, sigma, release, source, last)
 
+    def with_pose(self, places: Places) -> "_Registered":
+        """The recording in the specimen frame, after its pose was found; sigma then contains that of the pose."""
+        registration = replace(
+            self.registration,
+            pose=places.pose,
+            covariance=places.pose_covariance,
+            pose_from_model=False,
+            modulus=places.modulus,
+            modulus_sigma=places.modulus_sigma,
+        )
+        position = places.pose.apply(self.position)
+        by_pose = pose_sigma(places.pose_covariance, position)
+        sigma = np.hypot(places.pose.rotate_sigma(self.sigma), by_pose)
+        return replace(self, registration=registration, position=position, sigma=sigma)
+
     def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
         """Mean marker positions at rest before the release, or those of the first frame."""
         rest = slice(self.release.rest_start, max(self.release.start, self.release.rest_start + 1))
@@ -213,27 +228,53 @@ class _Registered:
         return FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface)
 
 
-def _found_markers(
-    dataset: Dataset, specimen: Specimen, registered: list[_Registered], settings: CaptureSettings
-) -> Markers:
-    """The markers at the places that the first frames show; as described where these cannot tell.
+def _find_places(
+    dataset: Dataset,
+    specimen: Specimen,
+    registered: list[_Registered],
+    known: Markers | None,
+    settings: CaptureSettings,
+) -> tuple[Markers, list[_Registered]]:
+    """The markers at the places that the first frames show, and the recordings with the poses that these show.
 
-    They cannot if they are no equilibria, or if the elements lock: such a mesh follows a bent body less closely than a
-    hand places a dot.
+    Places stay as described where the elements lock: such a mesh follows a bent body less closely than a hand places a
+    dot. First frames that are no equilibria show neither places nor poses.
+
+    Args:
+        dataset: with the markers as described.
+        specimen: its description.
+        registered: recordings; the pose of some may be unknown.
+        known: markers whose places are known.
+        settings: tolerances and methods.
 
     Raises:
         InputError: the places are farther from the described ones than the tolerance.
     """
-    if settings.initial == "moving" or specimen.material.integration != "enhanced":
-        return dataset.markers
-    frames = [item.first_frame(dataset, specimen, whole_surface=False) for item in registered]
-    poses = [
-        fit_pose_near_clamp(specimen, frame.target) if item.registration.pose_from_model else None
-        for item, frame in zip(registered, frames, strict=True)
+    markers = known or dataset.markers
+    fixed = known is not None or specimen.material.integration != "enhanced"
+    chosen = [k for k, item in enumerate(registered) if item.registration.pose_from_model or not fixed]
+    if settings.initial == "moving" or not chosen:
+        return markers, registered
+    described = replace(dataset, markers=markers)
+    frames = [registered[k].first_frame(described, specimen, whole_surface=False) for k in chosen]
+    unknown = [registered[k].registration.pose_from_model for k in chosen]
+    frames = [
+        replace(frame, load=1e-3 * registered[k].row.load_g) if posed else frame
+        for k, frame, posed in zip(chosen, frames, unknown, strict=True)
     ]
-    prior_sigma = np.broadcast_to(specimen.layout.sigma, len(dataset.markers.names))
-    markers = find_places(frames, poses, prior_sigma)
-    moved = np.linalg.norm(markers.rest - dataset.markers.rest, axis=1)
+    targets = [frame.target for frame, posed in zip(frames, unknown, strict=True) if posed]
+    pose = fit_pose_near_clamp(specimen, np.nanmean(targets, axis=0)) if targets else IDENTITY
+    sigma = 0.0 if fixed else specimen.layout.sigma
+    places = find_places(frames, unknown, pose, np.broadcast_to(sigma, len(markers.names)))
+    found = [item.with_pose(places) if item.registration.pose_from_model else item for item in registered]
+    if not fixed:
+        _check_places(specimen, dataset.markers, places.markers, settings)
+    return markers if fixed else places.markers, found
+
+
+def _check_places(specimen: Specimen, described: Markers, markers: Markers, settings: CaptureSettings) -> None:
+    """Raise InputError if the markers are farther from their described places than the tolerance."""
+    moved = np.linalg.norm(markers.rest - described.rest, axis=1)
     distance = float(np.sqrt((moved**2).mean()))
     if distance > settings.fit_tolerance:
         raise InputError(
@@ -241,7 +282,6 @@ def _found_markers(
             f"in the first frames (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); check at_mm, that "
             "the calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
         )
-    return markers
 
 
 def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, settings: CaptureSettings) -> Trajectory:
@@ -282,6 +322,8 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, setting
             "registration_covariance": registration.covariance,
             "registration_residual_mm": 1e3 * max(registration.residual.values(), default=0.0),
             "registration_markers": ", ".join(f"{k} {1e3 * v:.3f}" for k, v in registration.residual.items()),
+            "registration_modulus": registration.modulus,
+            "registration_modulus_sigma": registration.modulus_sigma,
             "set_aside": ", ".join(registration.outliers),
             "first_frame": release.start,
             "first_frame_from": item.release_source,

@@ -1,6 +1,7 @@
 """Text summary of a dataset: a table of recordings, warnings, and the contents of the file."""
 
 from pathlib import Path
+from typing import Any
 
 import h5py
 import numpy as np
@@ -12,6 +13,8 @@ from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 
 MISPLACED_MM = 2.0  # farther from its description than a hand misplaces a dot: four usual standard deviations
+
+TOLD_APART = 0.1  # standard deviation of log E up to which a frame is told apart from the material
 
 
 def recordings_table(dataset: Dataset) -> Table:
@@ -52,8 +55,7 @@ def warnings(dataset: Dataset) -> list[str]:
             )
     if names := dataset.registered_through_model:
         lines.append(
-            f"recordings {', '.join(names)}: their frame was found through the assumed material, which a fitted "
-            "material then depends on; film the undeformed specimen (--rest), or put three markers on the clamp"
+            f"recordings {', '.join(names)}: {_frame_through_model(dataset.trajectories[names[0]].attributes)}"
         )
     for name, item in dataset.trajectories.items():
         if outliers := item.attributes.get("set_aside"):
@@ -62,6 +64,20 @@ def warnings(dataset: Dataset) -> list[str]:
                 "at_mm, or the names in the tracks"
             )
     return lines
+
+
+def _frame_through_model(attributes: dict[str, Any]) -> str:
+    """What is known of a frame that was found through the model, and what would tell it."""
+    advice = "film the undeformed specimen (--rest), or put three markers on the clamp"
+    modulus, sigma = (
+        float(attributes.get(key, np.nan)) for key in ("registration_modulus", "registration_modulus_sigma")
+    )
+    if not np.isfinite(sigma):
+        return f"their frame was found through the assumed material, which a fitted material then depends on; {advice}"
+    found = f"their frame was found together with E = {1e-3 * modulus:.0f} kPa, {100 * sigma:.0f} % uncertain"
+    if sigma > TOLD_APART:
+        return f"{found}: the two cannot be told apart; {advice}, or give the loads that hang (load_g)"
+    return f"{found}, from the loads in recordings.csv, whose errors a fitted material then has; better {advice}"
 
 
 def print_contents(path: Path, console: Console) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rafl.capture.registration.rigid import IDENTITY, RigidTransform
+from rafl.capture.registration.rigid import IDENTITY, RigidTransform, pose_jacobian
 from rafl.common.errors import SimulationError
 from rafl.data.markers import Markers
 from rafl.simulation.simulator import Simulator
@@ -18,6 +18,9 @@ Array = NDArray[Any]
 # moment). The local part is the rest, which would dent the mesh to match single markers. It is fitted three times:
 # practically without it, with little of it, and with more, which is kept if it halves the remaining residual.
 LINEAR_FORCE_SIGMA, LOCAL_FORCE_SIGMAS = 1.0, (1e-5, 5e-3, 5e-2)
+# Of the force of a known load, as a share of its weight: a string within three degrees of the vertical.
+LOAD_SIGMA = 0.05
+HANGING_SIGMA = 3e-3  # distance of the place where the load hangs from the middle of its nodes [m]
 SURFACE_FORCE_SIGMA = 0.3  # of the local part, if forces act on the whole surface [N]
 INITIAL_DAMPING, MAX_DAMPING = 1e4, 1e16  # of a Levenberg-Marquardt step, as a multiple of the prior
 MAX_ITERATIONS = 100
@@ -39,6 +42,7 @@ class FirstFrame:
         sigma: of the target [m], (M, 3); equal along all axes if the pose is fitted too.
         recording: name, for messages.
         whole_surface: whether `nodes` are the whole surface, each with an independent force.
+        load: known load [kg] that hangs on `nodes`; 0 if the forces are unknown.
     """
 
     simulator: Simulator
@@ -48,6 +52,25 @@ class FirstFrame:
     sigma: Array
     recording: str
     whole_surface: bool = False
+    load: float = 0.0
+
+    def expected_force(self) -> Array:
+        """Mean of the forces' prior [N], (3 L)."""
+        weight = self.load * np.asarray(self.simulator.gravity)
+        return np.tile(weight / len(self.nodes), len(self.nodes))
+
+    def linear_force_sigma(self) -> Array:
+        """Prior standard deviations of the amplitudes of `linear_modes` [N], (up to 4).
+
+        A force F that acts at a distance d from the middle of nodes at x has the amplitude F d / sqrt(sum x^2).
+        """
+        positions = self.simulator.mesh.vertices[self.nodes]
+        count = linear_modes(positions).shape[1]
+        if self.load == 0.0:
+            return np.full(count, LINEAR_FORCE_SIGMA)
+        weight = self.load * float(np.linalg.norm(self.simulator.gravity))
+        arms = np.linalg.svd(positions - positions.mean(0), compute_uv=False)[: count - 1]
+        return weight * np.concatenate([[LOAD_SIGMA / np.sqrt(len(positions))], HANGING_SIGMA / arms])
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -81,8 +104,9 @@ class InitialState:
 def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> InitialState:
     """Fit virtual forces such that the markers of the equilibrium match the first frame.
 
-    Levenberg-Marquardt minimises sum |x(q(f)) - target|^2 / sigma^2 + f . C^-1 f, where C is the prior covariance of
-    the forces. The implicit function theorem gives the Jacobian through the equilibrium, dx/df = dx/dq K^-1.
+    Levenberg-Marquardt minimises sum |x(q(f)) - target|^2 / sigma^2 + (f - f0) . C^-1 (f - f0), where f0 and C are
+    mean and covariance of the forces' prior. The implicit function theorem gives the Jacobian through the equilibrium,
+    dx/df = dx/dq K^-1.
 
     The mesh only approximates the specimen. If forces act on the free end, the first fit allows only forces that vary
     linearly over the nodes. Its residual beyond sigma is added to sigma in the fits that follow, so that they do not
@@ -116,50 +140,45 @@ class LinearFit:
 
     Attributes:
         force: virtual nodal forces [N], (N, 3).
-        pose: from the frame of the target to the specimen frame.
         q: node positions [m], (N, 3).
-        residual: markers of the mesh minus measured markers in the specimen frame [m], (3 M').
+        residual: markers of the mesh minus measured markers [m], (3 M').
         weight: of the residuals in the objective [1/m], (3 M').
     """
 
     force: Array
-    pose: RigidTransform
     q: Array
     residual: Array
     weight: Array
 
 
-def fit_linear_forces(
-    frame: FirstFrame, pose: RigidTransform | None, model_sigma: float, start: LinearFit | None = None
-) -> LinearFit:
-    """Fit forces that vary linearly over the nodes, and the pose if an initial one is given, from an earlier fit.
+def fit_linear_forces(frame: FirstFrame, model_sigma: float, start: LinearFit | None = None) -> LinearFit:
+    """Fit forces that vary linearly over the nodes, from an earlier fit.
 
     model_sigma: standard deviation of the difference between mesh and specimen [m].
 
     Raises:
         SimulationError: an equilibrium could not be found.
     """
-    search = _LevenbergMarquardt(frame, pose is not None, LOCAL_FORCE_SIGMAS[0], model_sigma)
-    force = np.zeros_like(frame.simulator.mesh.vertices) if start is None else start.force
-    found = search.minimise(force, start.pose if start else pose or IDENTITY, start.q if start else None)
-    return LinearFit(found.force, found.pose, found.q, found.residual, search.weight)
+    search = _LevenbergMarquardt(frame, False, LOCAL_FORCE_SIGMAS[0], model_sigma)
+    force = np.zeros_like(frame.simulator.mesh.vertices)
+    force[frame.nodes] = frame.expected_force().reshape(-1, 3)
+    if start is not None:
+        force = start.force
+    found = search.minimise(force, IDENTITY, start.q if start else None)
+    return LinearFit(found.force, found.q, found.residual, search.weight)
 
 
-def linear_jacobian(frame: FirstFrame, fit: LinearFit, with_pose: bool) -> tuple[Array, Array, Array]:
-    """Weighted derivatives of the residuals (3 M', n) by the linear modes of the forces and the pose.
+def linear_jacobian(frame: FirstFrame, fit: LinearFit) -> tuple[Array, Array]:
+    """Weighted residuals (3 M' + n) of the markers and of the forces' prior, and their derivatives by the linear modes.
 
     Returns:
-        The derivatives, the precision matrix of the prior (n, n), and half the prior's gradient (n).
+        The derivatives by the amplitudes of the n modes, (3 M' + n, n), and the residuals.
     """
     modes = np.kron(linear_modes(frame.simulator.mesh.vertices[frame.nodes]), np.eye(3))
-    jacobian = marker_jacobian(frame, fit.q) @ modes
-    prior = np.full(jacobian.shape[1], LINEAR_FORCE_SIGMA**-2.0)
-    slope = prior * (modes.T @ fit.force[frame.nodes].ravel())
-    if with_pose:
-        posed = fit.pose.apply(frame.target[frame.measured])
-        jacobian = np.concatenate([jacobian, -_pose_jacobian(posed)], axis=1)
-        prior, slope = (np.concatenate([part, np.zeros(6)]) for part in (prior, slope))
-    return fit.weight[:, None] * jacobian, np.diag(prior), slope
+    prior = np.repeat(1.0 / frame.linear_force_sigma(), 3)
+    amplitude = modes.T @ (fit.force[frame.nodes].ravel() - frame.expected_force())
+    jacobian = fit.weight[:, None] * (marker_jacobian(frame, fit.q) @ modes)
+    return np.concatenate([jacobian, np.diag(prior)]), np.concatenate([fit.weight * fit.residual, prior * amplitude])
 
 
 def _rms(frame: FirstFrame, residual: Array) -> float:
@@ -188,8 +207,9 @@ class _LevenbergMarquardt:
 
     def __init__(self, frame: FirstFrame, with_pose: bool, local_sigma: float, model_sigma: float) -> None:
         self.frame, self.with_pose = frame, with_pose
-        precision = force_precision(frame.simulator.mesh.vertices[frame.nodes], local_sigma)
+        precision = force_precision(frame, local_sigma)
         self.prior = np.kron(precision, np.eye(3))
+        self.expected = frame.expected_force()
         self.weight = 1.0 / np.sqrt(frame.sigma[frame.measured].ravel() ** 2 + model_sigma**2)
 
     def evaluate(self, force: Array, pose: RigidTransform, start: Array | None) -> _Estimate:
@@ -203,7 +223,7 @@ class _LevenbergMarquardt:
             q = simulator.minimise(start[None], zero, start[None], total, simulator.constitutive_state(1), label)[0]
         positions = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.measured]
         residual = (positions - pose.apply(frame.target[frame.measured])).ravel()
-        f = force[frame.nodes].ravel()
+        f = force[frame.nodes].ravel() - self.expected
         return _Estimate(force, pose, q, residual, float(((self.weight * residual) ** 2).sum() + f @ self.prior @ f))
 
     def minimise(self, force: Array, pose: RigidTransform, start: Array | None) -> _Estimate:
@@ -244,11 +264,11 @@ class _LevenbergMarquardt:
         jacobian = marker_jacobian(self.frame, current.q)
         if self.with_pose:
             posed = current.pose.apply(self.frame.target[self.frame.measured])
-            jacobian = np.concatenate([jacobian, -_pose_jacobian(posed)], axis=1)
+            jacobian = np.concatenate([jacobian, -pose_jacobian(posed).reshape(-1, 6)], axis=1)
         jacobian *= self.weight[:, None]
         gradient, hessian = jacobian.T @ (self.weight * current.residual), jacobian.T @ jacobian
         count = len(self.prior)
-        gradient[:count] += self.prior @ current.force[self.frame.nodes].ravel()
+        gradient[:count] += self.prior @ (current.force[self.frame.nodes].ravel() - self.expected)
         hessian[:count, :count] += self.prior
         return gradient, hessian
 
@@ -278,7 +298,7 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
     weight = 1.0 / sigma[frame.measured].ravel()[known]
     weighted = weight[:, None] * jacobian[known]
     local = SURFACE_FORCE_SIGMA if frame.whole_surface else LOCAL_FORCE_SIGMAS[1]
-    precision = force_precision(frame.simulator.mesh.vertices[frame.nodes], local)
+    precision = force_precision(frame, local)
     prior = np.kron(precision, np.eye(3)) / FORCE_CHANGE_RATE**2
     gradient = weighted.T @ (weight * velocity[frame.measured].ravel()[known])
     force_rate = np.zeros_like(q)
@@ -286,11 +306,11 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
     return np.asarray(frame.simulator.solve_tangent(q[None], force_rate[None])[0])
 
 
-def force_precision(positions: Array, local_sigma: float) -> Array:
-    """Inverse prior covariance [1/N^2], (L, L), of one component of the forces on nodes at `positions` (L, 3)."""
-    modes = linear_modes(positions)
-    linear = modes @ modes.T
-    precision: Array = linear / LINEAR_FORCE_SIGMA**2 + (np.eye(len(positions)) - linear) / local_sigma**2
+def force_precision(frame: FirstFrame, local_sigma: float) -> Array:
+    """Inverse prior covariance [1/N^2], (L, L), of one component of the forces on the frame's nodes."""
+    modes = linear_modes(frame.simulator.mesh.vertices[frame.nodes])
+    linear = (modes * frame.linear_force_sigma() ** -2.0) @ modes.T
+    precision: Array = linear + (np.eye(len(modes)) - modes @ modes.T) / local_sigma**2
     return precision
 
 
@@ -312,9 +332,3 @@ def marker_jacobian(frame: FirstFrame, q: Array) -> Array:
     solved = frame.simulator.solve_tangent(q[None], np.moveaxis(rows.reshape(-1, *q.shape), 0, -1)[None])[0]
     jacobian: Array = np.moveaxis(solved[frame.nodes], -1, 0).reshape(3 * len(measured), -1)
     return jacobian
-
-
-def _pose_jacobian(points: Array) -> Array:
-    """Derivatives of posed points (M', 3) by a rotation vector and a translation after the pose, (3 M', 6)."""
-    rotation = np.cross(np.eye(3)[None], points[:, None]).swapaxes(1, 2)  # (M', 3, axis)
-    return np.concatenate([rotation, np.broadcast_to(np.eye(3), rotation.shape)], axis=2).reshape(-1, 6)

@@ -1,6 +1,6 @@
-"""Places of the markers on the undeformed body, found from the first frames of all recordings together."""
+"""Places of the markers on the undeformed body and an unknown frame, from the first frames of all recordings."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -8,36 +8,58 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.initial import FirstFrame, LinearFit, fit_linear_forces, linear_jacobian
-from rafl.capture.registration.rigid import RigidTransform
+from rafl.capture.registration.rigid import RigidTransform, pose_jacobian
 from rafl.data.markers import Markers, embed
 
 Array = NDArray[Any]
 
 MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
-MIN_PRIOR_SIGMA = 1e-9  # of a place that is exactly known [m]
+MIN_PRIOR_SIGMA = 1e-8  # of a place that is exactly known [m]
 MAX_MODULUS_STEP = 0.3  # of log E in one iteration
 MAX_ITERATIONS = 10
-STEP_TOLERANCE = 1e-6  # [m]; the search ends with a smaller change of every place
+# The search ends with a smaller change of every place [m], of log E, and of the pose [rad, m].
+STEP_TOLERANCE, MODULUS_TOLERANCE, POSE_TOLERANCE = 1e-6, 1e-3, 1e-5
 # The mesh follows the shape of a bent specimen to about this fraction of its deflection, and not closer than this
 # distance [m]. The error is alike in all recordings, so that more of them do not average it out.
 MODEL_FRACTION, MIN_MODEL_SIGMA = 0.01, 1e-5
 
 
-def find_places(frames: list[FirstFrame], poses: list[RigidTransform | None], prior_sigma: Array) -> Markers:
-    """The markers at the places that the first frames of several recordings of one specimen show.
+@dataclass(frozen=True)
+class Places:
+    """What the first frames of several recordings show together.
 
-    A marker's place is the same in all recordings, while forces and poses differ. Gauss-Newton minimises over places,
-    log E, and for every recording the virtual forces that vary linearly over their nodes, and the pose where it is
-    fitted too:
+    Attributes:
+        markers: at their places.
+        pose: from an unknown frame to the specimen frame; the initial one if none was unknown.
+        pose_covariance: of a rotation vector and a translation applied after the pose [rad, m], (6, 6).
+        modulus: Young's modulus [Pa].
+        modulus_sigma: standard deviation of its logarithm.
+    """
+
+    markers: Markers
+    pose: RigidTransform
+    pose_covariance: Array
+    modulus: float
+    modulus_sigma: float
+
+
+def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransform, prior_sigma: Array) -> Places:
+    """Places of the markers, and an unknown pose, from the first frames of several recordings of one specimen.
+
+    A marker's place is the same in all recordings, and so is the frame of the recordings whose frame is unknown, while
+    forces differ. Gauss-Newton minimises over log E, the pose and the places, and for every recording the virtual
+    forces that vary linearly over their nodes:
 
         sum |x - target|^2 / (sigma^2 + R model_sigma^2) + sum |moved|^2 / prior_sigma^2 + the forces' prior + E's prior
 
-    with R recordings, and a model_sigma that follows from the deflection (`MODEL_FRACTION`). The forces and poses are
-    eliminated recording by recording (Schur complement).
+    with R recordings, and a model_sigma that follows from the deflection (`MODEL_FRACTION`). The forces are eliminated
+    recording by recording. A pose and an unknown force can hardly be told apart, nor then can E;
+    known loads decide (`FirstFrame.load`).
 
     Args:
         frames: observations, with the markers embedded at their places in the layout.
-        poses: initial poses where the pose is fitted too, else None, one for each frame.
+        unknown: which targets are in the unknown frame.
+        pose: initial guess of the unknown pose.
         prior_sigma: standard deviations of the places in the layout [m], (M).
 
     Raises:
@@ -47,52 +69,72 @@ def find_places(frames: list[FirstFrame], poses: list[RigidTransform | None], pr
     count, log_modulus, markers = len(layout.names), 0.0, layout
     moved = np.zeros((count, 3))
     fits: list[LinearFit | None] = [None] * len(frames)
-    model_sigma = float(prior_sigma.max())  # until the deflection is known
+    model_sigma = MODEL_FRACTION * float(np.ptp(layout.rest, axis=0).max())  # until the deflection is known
     by_place = np.repeat(np.maximum(prior_sigma, MIN_PRIOR_SIGMA) ** -2.0, 3)
-    precision = np.concatenate([[MODULUS_SIGMA**-2.0], by_place])
+    # A pose that no frame depends on stays as it is.
+    by_pose = np.zeros(6) if any(unknown) else np.ones(6)
+    precision = np.concatenate([[MODULUS_SIGMA**-2.0], by_pose, by_place])
     for _ in range(MAX_ITERATIONS):
         modulus = simulator.material.youngs_modulus * np.exp(log_modulus)
         softened = replace(simulator, material=replace(simulator.material, youngs_modulus=modulus))
-        current = [replace(frame, simulator=softened, markers=markers) for frame in frames]
-        hessian, gradient = np.diag(precision), precision * np.concatenate([[log_modulus], moved.ravel()])
+        hessian = np.diag(precision)
+        gradient = precision * np.concatenate([[log_modulus], np.zeros(6), moved.ravel()])
         deflection = []
-        for k, (frame, pose) in enumerate(zip(current, poses, strict=True)):
-            fit = fit_linear_forces(frame, pose, model_sigma, fits[k])
+        for k, frame in enumerate(frames):
+            current = replace(frame, simulator=softened, markers=markers)
+            if unknown[k]:
+                current = replace(current, target=pose.apply(frame.target))
+            fit = fit_linear_forces(current, model_sigma, fits[k])
             fits[k] = fit
-            own_hessian, own_gradient = _reduced_normal_equations(frame, fit, pose is not None)
+            own_hessian, own_gradient = _reduced_normal_equations(current, fit, unknown[k])
             hessian += own_hessian
             gradient += own_gradient
             deflection.append(markers.positions(torch.from_numpy(fit.q)).numpy() - markers.rest)
-        step = -np.linalg.solve(hessian, gradient)
-        log_modulus += float(np.clip(step[0], -MAX_MODULUS_STEP, MAX_MODULUS_STEP))
-        moved = moved + step[1:].reshape(-1, 3)
+        covariance = _inverse(hessian)
+        step = -covariance @ gradient
+        step *= min(1.0, MAX_MODULUS_STEP / max(abs(step[0]), MAX_MODULUS_STEP))
+        log_modulus += float(step[0])
+        pose = pose.followed_by(step[1:7])
+        moved = moved + step[7:].reshape(-1, 3)
         markers = embed(simulator.mesh, layout.names, layout.rest + moved)
         size = float(np.sqrt(np.mean(np.square(deflection).sum(-1))))
         model_sigma = float(np.sqrt(len(frames))) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
-        if np.abs(step[1:]).max() < STEP_TOLERANCE:
+        tolerance = np.concatenate(
+            [[MODULUS_TOLERANCE], np.full(6, POSE_TOLERANCE), np.full(3 * count, STEP_TOLERANCE)]
+        )
+        if (np.abs(step) < tolerance).all():
             break
-    covariance = np.linalg.inv(hessian)
     sigma = np.sqrt(np.diag(covariance))
-    return replace(markers, moved=moved, place_sigma=sigma[1:].reshape(-1, 3))
+    markers = replace(markers, moved=moved, place_sigma=sigma[7:].reshape(-1, 3))
+    modulus = simulator.material.youngs_modulus * np.exp(log_modulus)
+    return Places(markers, pose, covariance[1:7, 1:7], modulus, float(sigma[0]))
 
 
-def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, with_pose: bool) -> tuple[Array, Array]:
-    """Half the Hessian and half the gradient of one recording's part by (log E, places), less forces and pose."""
-    local, prior, slope = linear_jacobian(frame, fit, with_pose)
+def _inverse(hessian: Array) -> Array:
+    """Inverse of a positive definite matrix whose rows differ in their units."""
+    scale = 1.0 / np.sqrt(np.diag(hessian))
+    return np.asarray(scale[:, None] * np.linalg.inv(scale[:, None] * hessian * scale) * scale)
+
+
+def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, posed: bool) -> tuple[Array, Array]:
+    """Half the Hessian and half the gradient of one recording's part by (log E, pose, places), less its forces."""
+    local, residual = linear_jacobian(frame, fit)
     rows = np.flatnonzero(np.repeat(frame.measured, 3))
-    whole = np.zeros((3 * len(frame.target), 1 + 3 * len(frame.target)))
+    whole = np.zeros((3 * len(frame.target), 7 + 3 * len(frame.target)))
     q = torch.from_numpy(fit.q)
     gain = frame.markers.axes(q) @ torch.linalg.inv(frame.markers.axes(torch.from_numpy(frame.simulator.mesh.vertices)))
     for m, own in enumerate(gain.numpy()):
-        whole[3 * m : 3 * m + 3, 1 + 3 * m : 4 + 3 * m] = own
+        whole[3 * m : 3 * m + 3, 7 + 3 * m : 10 + 3 * m] = own
+    if posed:
+        whole[:, 1:7] = -pose_jacobian(frame.target).reshape(-1, 6)
     # The internal forces are proportional to E, and in equilibrium equal to the weight and the virtual forces.
     by_modulus = -frame.simulator.solve_tangent(fit.q[None], (frame.simulator.weight + fit.force)[None])[0]
     corners = frame.markers.corner_jacobian(q).numpy()
     whole[:, 0] = np.einsum("micj,mcj->mi", corners, by_modulus[frame.markers.quad]).ravel()
-    shared = fit.weight[:, None] * whole[rows]
-    inverse = np.linalg.inv(local.T @ local + prior)
-    residual = fit.weight * fit.residual
-    mixed = local.T @ shared
-    hessian = shared.T @ shared - mixed.T @ inverse @ mixed
-    gradient = shared.T @ residual - mixed.T @ inverse @ (local.T @ residual + slope)
-    return hessian, gradient
+    shared = np.zeros((len(residual), whole.shape[1]))
+    shared[: len(rows)] = fit.weight[:, None] * whole[rows]
+    # What the forces can explain is taken out.
+    basis = np.linalg.qr(local)[0]
+    shared -= basis @ (basis.T @ shared)
+    residual = residual - basis @ (basis.T @ residual)
+    return shared.T @ shared, shared.T @ residual

@@ -46,7 +46,9 @@ class Registration:
         residual: distance of the markers used from their layout positions [m], by name.
         outliers: names of markers that are left out.
         covariance: of the pose, (6, 6), as in `RigidFit`; NaN if unknown.
-        pose_from_model: whether the pose is still unknown and the fit of the first frame must find it.
+        pose_from_model: whether the pose is still unknown and must be found from deformed shapes.
+        modulus: E that was found with the pose [Pa]; NaN if it was not.
+        modulus_sigma: standard deviation of its logarithm.
     """
 
     method: str
@@ -55,6 +57,8 @@ class Registration:
     outliers: tuple[str, ...] = ()
     covariance: Array = field(default_factory=lambda: np.full((6, 6), np.nan))
     pose_from_model: bool = False
+    modulus: float = np.nan
+    modulus_sigma: float = np.nan
 
 
 def combined_layout(specimen: Specimen) -> tuple[tuple[str, ...], Array]:

@@ -36,7 +36,7 @@ def truth(small_specimen: Specimen) -> np.ndarray:
 
 
 def build(specimen: Specimen, folder: Path, settings: CaptureSettings = SETTINGS, **row: object) -> Dataset:
-    rows = [RecordingRow(recording="q0", load_g=60, split="train", **row)]
+    rows = [RecordingRow(**{"recording": "q0", "load_g": 60, "split": "train"} | row)]
     return build_dataset(specimen, folder, rows, settings, "", lambda: None)
 
 
@@ -128,6 +128,25 @@ def test_without_a_rest_pose_the_pose_is_fitted_with_the_model(
     assert "film the undeformed specimen (--rest)" in warnings(built)[0]
     assert np.abs(item.markers - truth[1:]).max() < 5e-4
     assert item.attributes["fit_residual_mm"] < 0.05
+
+
+def test_a_frame_found_through_the_model_does_not_absorb_a_wrong_modulus(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    """The specimen is half as stiff as assumed. The known load tells; an unknown one leaves E and the frame open."""
+    write_c3d(tmp_path / "q0.c3d", list(small_specimen.layout.names), in_lab_frame(truth[1:]))
+    stiff = replace(small_specimen.material, youngs_modulus=2.0 * small_specimen.material.youngs_modulus)
+    assumed = replace(small_specimen, material=stiff)
+    built = build(assumed, tmp_path)
+    item = built.trajectories["q0"]
+    found, sigma = (float(str(item.attributes[f"registration_modulus{end}"])) for end in ("", "_sigma"))
+    assert abs(np.log(found / small_specimen.material.youngs_modulus)) < 2.0 * sigma
+    assert sigma < 0.1
+    assert np.abs(item.markers - truth[1:]).max() < 5e-4
+    assert (np.abs(item.markers - truth[1:]) < 4.0 * item.sigma).all()
+    assert "from the loads in recordings.csv" in warnings(built)[0]
+    unknown = build(assumed, tmp_path, load_g=0)
+    assert "cannot be told apart" in warnings(unknown)[0]
 
 
 def test_an_outlier_is_left_out_and_named(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:

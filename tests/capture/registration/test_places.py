@@ -8,14 +8,16 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from rafl.capture.registration.initial import FirstFrame
-from rafl.capture.registration.places import find_places
+from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.registration import fit_pose_near_clamp
+from rafl.capture.registration.rigid import IDENTITY
 from rafl.capture.specimen.specimen import Specimen
 from rafl.data.markers import Markers, embed
 from rafl.data.synthetic import loaded_equilibria, with_material
 
 LOADS = np.array([0.02, 0.05, 0.08, 0.11])
 MARKER_SIGMA = 1e-5  # [m]
+TURN, SHIFT = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix(), np.array([0.003, -0.002, 0.004])
 
 
 def misplacement(specimen: Specimen) -> np.ndarray:
@@ -42,9 +44,22 @@ def first_frames(specimen: Specimen, offset: np.ndarray, stiffness: float = 1.0)
     return frames
 
 
-def find(specimen: Specimen, frames: list[FirstFrame], prior_sigma: float = 0.5e-3, with_pose: bool = False) -> Markers:
-    poses = [fit_pose_near_clamp(specimen, frame.target) if with_pose else None for frame in frames]
-    return find_places(frames, poses, np.full(len(frames[0].target), prior_sigma))
+def find(specimen: Specimen, frames: list[FirstFrame], prior_sigma: float = 0.5e-3) -> Markers:
+    return find_places(frames, [False] * len(frames), IDENTITY, np.full(len(frames[0].target), prior_sigma)).markers
+
+
+def moved_away(frames: list[FirstFrame], loads: np.ndarray | None = None) -> list[FirstFrame]:
+    """The same as recorded in another frame; with loads [kg] that are known, or not."""
+    loads = np.zeros(len(frames)) if loads is None else loads
+    return [
+        replace(frame, target=frame.target @ TURN.T + SHIFT, load=float(load))
+        for frame, load in zip(frames, loads, strict=True)
+    ]
+
+
+def find_in_other_frame(specimen: Specimen, frames: list[FirstFrame], prior_sigma: float) -> Places:
+    pose = fit_pose_near_clamp(specimen, np.mean([frame.target for frame in frames], axis=0))
+    return find_places(frames, [True] * len(frames), pose, np.full(len(frames[0].target), prior_sigma))
 
 
 @pytest.mark.parametrize("stiffness", [1.0, 1.4])
@@ -60,20 +75,37 @@ def test_places_are_found_to_a_twentieth_of_a_millimetre(small_specimen: Specime
     np.testing.assert_allclose(found.rest, small_specimen.layout.positions + found.moved)
 
 
-def test_places_and_poses_are_found_together(small_specimen: Specimen) -> None:
+def test_places_are_found_in_an_unknown_frame(small_specimen: Specimen) -> None:
     """Without a known frame, the shape that the dots form is found; its position follows from their prior."""
     offset = misplacement(small_specimen)
-    turn = Rotation.from_rotvec([0.02, -0.03, 0.01]).as_matrix()
-    frames = [
-        replace(frame, target=frame.target @ turn.T + np.array([0.003, -0.002, 0.004]))
-        for frame in first_frames(small_specimen, offset)
-    ]
-    found = find(small_specimen, frames, with_pose=True)
+    frames = moved_away(first_frames(small_specimen, offset))
+    found = find_in_other_frame(small_specimen, frames, 0.5e-3).markers
     assert found.moved is not None
     sides = [np.linalg.norm(x[:, None] - x[None], axis=-1) for x in (found.rest, found.rest - found.moved + offset)]
     described = np.linalg.norm(found.rest[:, None] - found.moved[:, None] - found.rest + found.moved, axis=-1)
     assert np.sqrt(((sides[0] - sides[1]) ** 2).mean()) < 0.06e-3
     assert np.sqrt(((described - sides[1]) ** 2).mean()) > 0.2e-3
+
+
+@pytest.mark.parametrize("stiffness", [0.7, 1.6])
+def test_known_loads_tell_the_frame_from_the_material(small_specimen: Specimen, stiffness: float) -> None:
+    """Loads that hang within 5 % of the vertical give E to about that; the frame does not absorb its error."""
+    frames = first_frames(small_specimen, np.zeros_like(small_specimen.layout.positions), stiffness)
+    places = find_in_other_frame(small_specimen, moved_away(frames, LOADS), 0.0)
+    error = np.log(places.modulus / (stiffness * small_specimen.material.youngs_modulus))
+    assert abs(error) < 0.05
+    assert abs(error) < 3.0 * places.modulus_sigma
+    assert places.modulus_sigma < 0.1
+    assert np.linalg.norm(places.pose.rotation @ TURN - np.eye(3)) < 0.01
+    np.testing.assert_allclose(places.pose.apply(SHIFT[None])[0], 0.0, atol=0.2e-3)
+
+
+def test_without_known_loads_frame_and_material_cannot_be_told_apart(small_specimen: Specimen) -> None:
+    frames = first_frames(small_specimen, np.zeros_like(small_specimen.layout.positions), 1.6)
+    places = find_in_other_frame(small_specimen, moved_away(frames), 0.5e-3)
+    assert places.modulus_sigma > 0.25
+    error = np.log(places.modulus / (1.6 * small_specimen.material.youngs_modulus))
+    assert abs(error) < 3.0 * places.modulus_sigma
 
 
 def test_places_that_are_exactly_known_stay(small_specimen: Specimen) -> None:
