@@ -11,6 +11,7 @@ from rafl.capture.dataset.marker_tables import METRES, read_marker_table
 from rafl.capture.registration.recording import Recording
 from rafl.common.errors import InputError
 from rafl.common.files import sha256
+from rafl.common.names import require_names
 from rafl.tracking.reconstruction.gap_filling import MISSING
 from rafl.tracking.reconstruction.tracks import read_tracks
 
@@ -26,8 +27,9 @@ def find_sources(folder: Path, recording: str) -> list[Path]:
     """The files of a recording; the first one says most about it.
 
     Raises:
-        InputError: no file.
+        InputError: no file, or a name that leads out of the folder.
     """
+    require_names([recording], "recording")
     if not folder.is_dir():
         raise InputError(f"expected a folder of tracks at {folder}, found none; check the path")
     found = [path for end in ENDS if (path := folder / f"{recording}{end}").is_file()]

@@ -11,6 +11,7 @@ from scipy.ndimage import label
 
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
+from rafl.common.names import PathInside
 from rafl.common.yaml_files import StrictModel
 from rafl.fem.mesh import HexMesh
 
@@ -32,7 +33,7 @@ class Geometry(StrictModel):
     cells: tuple[int, int, int] | None = None
     rectangles: list[tuple[int, int]] | None = Field(default=None, min_length=1)
     ellipses: list[tuple[float, float] | tuple[float, float, float]] | None = Field(default=None, min_length=1)
-    surface: str | None = None
+    surface: PathInside | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> "Geometry":

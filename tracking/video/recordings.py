@@ -4,7 +4,8 @@ from pathlib import Path
 
 from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
-from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, natural_key, open_video
+from rafl.common.names import require_names
+from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, open_video, visible_entries
 
 
 def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Video]]:
@@ -39,17 +40,18 @@ def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, 
             )
         found[recording][camera] = path
 
-    for path in [videos] if is_video(videos) else sorted(videos.iterdir(), key=natural_key):
+    for path in [videos] if is_video(videos) else visible_entries(videos):
         if is_video(path):
             add(*_split_name(path, rig, calib), path)
         elif path.is_dir():
-            for part in sorted(path.iterdir(), key=natural_key):
+            for part in visible_entries(path):
                 if is_video(part):
                     name = part.name if part.is_dir() else part.stem
                     _check_camera(name, rig, calib, part)
                     add(path.name, name, part)
     if not found:
         raise InputError(f"expected videos in {videos}, found none; name them <recording>/<camera>.mp4")
+    require_names(found, f"recordings in {videos}")
     for recording, cameras in found.items():
         missing = set(rig.cameras) - set(cameras)
         if missing:
