@@ -10,6 +10,7 @@ from rafl.common.yaml_files import LARGEST
 
 # Types of elements in files, by `numpy.dtype.kind`, and their words.
 KINDS = {"number": "fiu", "integer": "iu", "truth": "b", "text": "SOU"}
+KIND_WORDS = dict.fromkeys("SOU", "text")  # for types whose own names say little
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,9 @@ def check_shape(label: str, array: Any, expected: ArrayFormat, lengths: dict[str
         ValueError: the array differs; the message names it.
     """
     if array.dtype.kind not in KINDS[expected.kind]:
-        raise ValueError(f"{label}: expected elements of type {expected.kind}, found {array.dtype}")
+        raise ValueError(
+            f"{label}: expected elements of type {expected.kind}, found {KIND_WORDS.get(array.dtype.kind, array.dtype)}"
+        )
     if len(array.shape) == len(expected.shape):
         for axis, length in zip(expected.shape, array.shape, strict=True):
             if isinstance(axis, str):

@@ -1,17 +1,19 @@
 """Atomic writing of files, checks of paths, and hashes."""
 
+import errno
 import glob
 import hashlib
 import os
 import platform
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from rafl.common.errors import InputError
 
+PROBE_BYTES = 65536  # written for a moment to see whether a disk has room; the smallest outputs need as much
 PREFIX_CHARACTERS = 30  # of a file's name at the begin of its temporary file's name, at most 120 of 255 bytes
 
 
@@ -35,7 +37,7 @@ def atomic_file(path: Path, read_back: ReadBack | None = None) -> Iterator[Path]
     """
     if path.is_dir():
         raise InputError(f"expected a file to write at {path}, found a folder; name a file in it")
-    with _new_folders(path.parent):
+    with new_folders(path.parent):
         _remove_stale_files(path)
         temporary = _create_temporary_file(path)
         try:
@@ -53,7 +55,7 @@ def atomic_file(path: Path, read_back: ReadBack | None = None) -> Iterator[Path]
             temporary.replace(path)
         except OSError as error:
             if error.filename not in (None, str(temporary)):
-                raise  # about another file
+                raise
             raise OSError(error.errno, error.strerror or str(error), str(path)) from None
         finally:
             temporary.unlink(missing_ok=True)
@@ -68,7 +70,7 @@ def _check_readable(temporary: Path, path: Path, read_back: ReadBack) -> None:
 
 
 @contextmanager
-def _new_folders(folder: Path) -> Iterator[None]:
+def new_folders(folder: Path) -> Iterator[None]:
     """Make a folder and those above it; remove the new ones if the content fails and leaves them empty."""
     made = [part for part in (folder, *folder.parents) if not part.exists()]
     try:
@@ -111,26 +113,83 @@ def _remove_stale_files(path: Path) -> None:
             continue
 
 
-def write_bytes(path: Path, content: bytes, read_back: ReadBack | None = None) -> None:
+def write_bytes(path: Path, content: bytes | memoryview, read_back: ReadBack | None = None) -> None:
     """Write `content` to `path` by `atomic_file`.
 
     Raises:
-        InputError: the disk has too little space, or as `atomic_file` says.
-        OSError: as `atomic_file` says.
+        InputError: as `atomic_file` says.
+        OSError: the disk has too little space, or as `atomic_file` says.
     """
+    with _written_file(path, content, read_back):
+        pass
+
+
+@contextmanager
+def _written_file(path: Path, content: bytes | memoryview, read_back: ReadBack | None = None) -> Iterator[None]:
+    """A file that is written now, and takes its place when the context ends without an error."""
     with atomic_file(path, read_back) as temporary:
         free = shutil.disk_usage(path.parent).free
         if free < len(content):
-            raise InputError(
-                f"{path}: expected {len(content) / 1e6:.2f} MB of free space to write it, found {free / 1e6:.2f} MB; "
-                "free some, or write to another disk"
-            )
+            needed = f"expected {len(content) / 1e6:.2f} MB of free space to write it, found {free / 1e6:.2f} MB"
+            raise OSError(errno.ENOSPC, needed, str(path))
         temporary.write_bytes(content)
+        yield
+
+
+@contextmanager
+def written_texts(texts: Mapping[Path, str]) -> Iterator[None]:
+    """Files that are written now, and take their places together when the context ends without an error.
+
+    Raises:
+        InputError: as `write_bytes` says; none of the files has changed then.
+        OSError: likewise.
+    """
+    with ExitStack() as stack:
+        for path, text in texts.items():
+            stack.enter_context(_written_file(path, _encoded(text)))
+        yield
+
+
+@contextmanager
+def new_content(folder: Path) -> Iterator[None]:
+    """A folder that is filled in the context; if that fails, what has come into it is removed."""
+    with new_folders(folder):
+        before = set(folder.iterdir())
+        try:
+            yield
+        except BaseException:
+            for part in set(folder.iterdir()) - before:
+                shutil.rmtree(part) if part.is_dir() else part.unlink()
+            raise
+
+
+def _encoded(text: str) -> bytes:
+    return text.encode("utf-8", "backslashreplace")
 
 
 def write_text(path: Path, text: str, read_back: ReadBack | None = None) -> None:
     """Write `text` to `path` by `atomic_file`, as UTF-8."""
-    write_bytes(path, text.encode("utf-8", "backslashreplace"), read_back)
+    write_bytes(path, _encoded(text), read_back)
+
+
+def require_writable(path: Path) -> None:
+    """Check before a long computation that a file can be written to `path`, or into the folder `path`.
+
+    Raises:
+        InputError: the folder, or the one in which it would be made, cannot be written to, or its disk is full.
+    """
+    folder = next(part for part in (path.absolute(), *path.absolute().parents) if part.exists())
+    if folder.is_file():
+        if folder != path.absolute():
+            raise InputError(f"expected a folder at {folder}, found a file; write elsewhere, or move it away")
+        folder = folder.parent
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.write(bytes(PROBE_BYTES))
+    except OSError as error:
+        raise InputError(
+            f"{path}: expected to be able to write there, found: {error.strerror}; free or allow it"
+        ) from None
 
 
 def require_file(path: Path, label: str) -> Path:

@@ -96,8 +96,8 @@ def _array_bytes(name: str, item: h5py.Dataset) -> int:
     if None in shapes:
         raise ValueError(f"{name}: expected an array, found no values")
     _check_elements(name, item.dtype)
-    elements = max(math.prod(shape) for shape in shapes)
-    return elements * int(item.dtype.itemsize)
+    elements: int = max(math.prod(shape) for shape in shapes)
+    return elements * item.dtype.itemsize  # type: ignore[no-any-return]
 
 
 def _attribute_bytes(name: str, item: Any) -> int:

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.common.arrays import ArrayFormat, check_shape, check_values
-from rafl.common.names import check_names
+from rafl.common.names import check_distinct, check_names, check_visible
 from rafl.data.markers import Markers
 from rafl.simulation.rollout import Start
 from rafl.simulation.simulator import Simulator
@@ -126,11 +126,7 @@ class Dataset:
         Raises:
             ValueError: a part is not; names it.
         """
-        for label, names in (("name", [self.name]), ("markers", self.markers.names), ("recordings", self.trajectories)):
-            try:
-                check_names(names)
-            except ValueError as reason:
-                raise ValueError(f"{label}: {reason}") from None
+        self._check_names()
         mesh, lengths = self.simulator.mesh, {"M": len(self.markers.names)}
         arrays = {"vertices": mesh.vertices, "hexes": mesh.hexes, "fixed": self.simulator.fixed}
         _check_arrays("mesh/", arrays, MESH_ARRAYS, lengths)
@@ -145,6 +141,20 @@ class Dataset:
         _require(bool(embedded.isfinite().all()), "markers/quad", "four different vertices of a face")
         for name, item in self.trajectories.items():
             self._check_trajectory(f"trajectories/{name}", item, {**lengths})
+
+    def _check_names(self) -> None:
+        """Recordings name parts of the file. The other names are only printed, and older files have any."""
+        try:
+            check_names(self.trajectories)
+        except ValueError as reason:
+            raise ValueError(f"recordings: {reason}") from None
+        for label, names in (("name", [self.name]), ("markers", self.markers.names)):
+            try:
+                for name in names:
+                    check_visible(name)
+                check_distinct(names)
+            except ValueError as reason:
+                raise ValueError(f"{label}: {reason}") from None
 
     def _check_trajectory(self, label: str, item: Trajectory, lengths: dict[str, int]) -> None:
         _check_arrays(f"{label}/", vars(item), RECORDING_ARRAYS | INITIAL_ARRAYS, lengths)

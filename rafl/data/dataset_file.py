@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from rafl.common.arrays import ArrayFormat, read_arrays
 from rafl.common.errors import InputError
 from rafl.common.hdf5_files import read_hdf5, write_hdf5
+from rafl.common.names import require_names
 from rafl.common.version import VERSION
 from rafl.common.yaml_files import check_format
 from rafl.data.dataset import (
@@ -65,10 +66,13 @@ def write_dataset(path: str | Path, dataset: Dataset) -> None:
     """Write a dataset file atomically.
 
     Raises:
+        InputError: the name of the specimen or a marker does not suit files, or the file cannot be written.
         ValueError: parts of the dataset are inconsistent.
     """
     path = Path(path)
     dataset.check()
+    require_names([dataset.name], "dataset")
+    require_names(dataset.markers.names, f"dataset {dataset.name}, markers")
     with write_hdf5(path, read_dataset) as file:
         _write(file, dataset, dataset.recipe)
 
@@ -95,7 +99,7 @@ def update_dataset(path: Path, dataset: Dataset) -> None:
             )
     dataset = replace(dataset, simulator=replace(other, time_step=own.time_step))
     dataset.check()
-    with read_hdf5(path, LABEL, ADVICE) as old, write_hdf5(path, read_dataset) as file:
+    with write_hdf5(path, read_dataset) as file, read_hdf5(path, LABEL, ADVICE) as old:
         _write(file, dataset, f"{earlier.recipe}\n# then\n{dataset.recipe}")
         for part in SPECIMEN_GROUPS:
             if file[part].attrs[HASH_ATTRIBUTE] != _digest(old[part]):
