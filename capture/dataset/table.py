@@ -11,7 +11,7 @@ from rafl.common.errors import InputError
 from rafl.common.files import require_file
 from rafl.common.names import Name, require_names
 from rafl.common.text_tables import read_table_text
-from rafl.common.yaml_files import StrictModel
+from rafl.common.yaml_files import StrictModel, describe_validation
 
 
 class RecordingRow(StrictModel):
@@ -63,9 +63,7 @@ def read_recording_rows(path: Path) -> list[RecordingRow]:
         try:
             rows.append(RecordingRow.model_validate(given))
         except pydantic.ValidationError as error:
-            first = error.errors()[0]
-            column = ".".join(map(str, first["loc"]))
-            raise InputError(f"{path} line {line}, column {column}: {first['msg']}; correct it") from None
+            raise InputError(f"{path} line {line}, column {describe_validation(error)}; correct it") from None
     if not rows:
         raise InputError(f"expected at least one recording in {path}, found none; add a row")
     require_names((row.recording for row in rows), f"{path}, column recording")

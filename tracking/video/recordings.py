@@ -9,6 +9,29 @@ from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, open_vid
 
 
 def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Video]]:
+    """The videos of each recording, opened, by camera.
+
+    Args:
+        videos: as for `find_videos`.
+        rig: as for `find_videos`.
+        calib: as for `find_videos`.
+
+    Raises:
+        InputError: as `find_videos` and `open_videos` say.
+    """
+    return {name: open_videos(paths, rig) for name, paths in find_videos(videos, rig, calib).items()}
+
+
+def open_videos(paths: dict[str, Path], rig: Rig) -> dict[str, Video]:
+    """Open the videos of one recording, by camera.
+
+    Raises:
+        InputError: one cannot be opened, or has another size than its camera.
+    """
+    return {camera: _open_checked(path, rig, camera) for camera, path in paths.items()}
+
+
+def find_videos(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Path]]:
     """Find the videos by recording and camera.
 
     Their names are `<recording>/<camera>.<ext>`, `<recording>_<camera>.<ext>`, or `<recording>.<ext>` if the rig has
@@ -59,10 +82,7 @@ def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, 
                 f"recording {recording}: expected a video of every camera in {calib}, found none of "
                 f"{', '.join(sorted(missing))}; add it, or calibrate without that camera"
             )
-    return {
-        recording: {camera: _open_checked(path, rig, camera) for camera, path in cameras.items()}
-        for recording, cameras in found.items()
-    }
+    return found
 
 
 def _split_name(path: Path, rig: Rig, calib: Path) -> tuple[str, str]:
