@@ -14,6 +14,19 @@ MAX_NAME_BYTES = 120  # in UTF-8: two names and `_overlay.mp4` fit into the 255 
 INVISIBLE = ("Cc", "Cf", "Cs", "Zl", "Zp")
 
 
+def check_visible(name: str) -> str:
+    """Return a name that can be printed.
+
+    Raises:
+        ValueError: the name is empty, or has a character that cannot be seen. The message begins with `expected`.
+    """
+    if not isinstance(name, str) or not name:
+        raise ValueError("expected a name, found an empty one")
+    if any(unicodedata.category(character) in INVISIBLE for character in name):
+        raise ValueError(f"expected a name of visible characters in one line, found {name!a:.80}")
+    return name
+
+
 def check_name(name: str) -> str:
     """Return a name that can be part of a file's name and of a path in HDF5.
 
@@ -21,10 +34,7 @@ def check_name(name: str) -> str:
         ValueError: the name is empty or too long, has a slash, a character that cannot be seen, or a space or a dot at
             an end. The message begins with `expected`.
     """
-    if not isinstance(name, str) or not name:
-        raise ValueError("expected a name, found an empty one")
-    if any(unicodedata.category(character) in INVISIBLE for character in name):
-        raise ValueError(f"expected a name of visible characters in one line, found {name!a:.80}")
+    check_visible(name)
     if "/" in name or "\\" in name:
         raise ValueError(f"expected a name without slashes, found {name!r:.80}")
     if name != name.strip() or name.strip(".") != name:

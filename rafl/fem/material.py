@@ -33,6 +33,19 @@ def lame(youngs_modulus: Any, poissons_ratio: Any) -> tuple[Any, Any]:
     return mu, lam
 
 
+SOFTEST = 1e3  # Young's modulus [Pa] below which no silicone is; the softest on sale have some 10 kPa
+
+
+def modulus_hint(youngs_modulus: float) -> str:
+    """A sentence about a Young's modulus [Pa] that looks as if it were given in kPa or MPa; else empty."""
+    if youngs_modulus >= SOFTEST:
+        return ""
+    return (
+        f"Young's modulus {youngs_modulus:g} Pa is below {SOFTEST:g} Pa, softer than any silicone; if it is in kPa, "
+        f"write {1e3 * youngs_modulus:g}"
+    )
+
+
 @dataclass(frozen=True)
 class Material:
     """A homogeneous, nearly incompressible rubber.
