@@ -11,6 +11,7 @@ from pydantic import Field, field_validator
 from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane
 from rafl.calibration.fields import Direction, PositivePair
 from rafl.common.files import write_text
+from rafl.common.names import Name, check_distinct, require_names
 from rafl.common.yaml_files import StrictModel, read_yaml
 
 FORMAT = "rafl-calibration/1"
@@ -19,9 +20,16 @@ PLANE_SIGMA_MM = 0.5  # of the markers' distances from their plane, unless given
 
 @dataclass(frozen=True)
 class Rig:
-    """Cameras by name, in one world frame."""
+    """Cameras by name, in one world frame.
+
+    Raises:
+        InputError: a camera's name is invalid; videos and groups in HDF5 files are named after it.
+    """
 
     cameras: dict[str, Camera]
+
+    def __post_init__(self) -> None:
+        require_names(self.cameras, "cameras")
 
 
 class _PlaneEntry(StrictModel):
@@ -110,7 +118,13 @@ _CameraEntry = Annotated[_OrthographicEntry | _PinholeEntry, Field(discriminator
 
 class _RigFile(StrictModel):
     format: str
-    cameras: dict[str, _CameraEntry] = Field(min_length=1)
+    cameras: dict[Name, _CameraEntry] = Field(min_length=1)
+
+    @field_validator("cameras")
+    @classmethod
+    def _check_distinct(cls, value: dict[str, _CameraEntry]) -> dict[str, _CameraEntry]:
+        check_distinct(value)
+        return value
 
 
 def read_calibration(path: str | Path) -> Rig:

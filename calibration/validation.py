@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib import rcParams
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -13,9 +14,11 @@ from scipy.spatial.transform import Rotation
 
 from rafl.calibration.board import View
 from rafl.calibration.camera import Camera
-from rafl.common.files import atomic_file
+from rafl.common.files import write_bytes
 
 Array = NDArray[Any]
+
+rcParams["text.parse_math"] = False  # a name with $ is a name
 
 START_TILTS = np.radians([0.0, 25.0])  # initial tilts of the board in the search for its pose
 ARROW_SCALE = 200.0  # enlargement of the residuals drawn as arrows
@@ -81,5 +84,4 @@ def write_residual_plot(path: Path, size: tuple[int, int], checked: list[Checked
     right.set(xlabel="residual of a coordinate [px]", yticks=[])
     content = io.BytesIO()
     figure.savefig(content, format="png", dpi=110)
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(content.getvalue())
+    write_bytes(path, content.getvalue())

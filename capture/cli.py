@@ -1,5 +1,6 @@
 """The commands `rafl-render` and `rafl-capture`: their options, and the checks that need no heavy import."""
 
+import math
 import re
 from enum import StrEnum
 from pathlib import Path
@@ -64,7 +65,7 @@ def render(
     require_file(specimen, SPECIMEN)
     if out.exists() and any(out.iterdir()):
         raise InputError(f"expected a new or empty folder at {out}, found files in it; choose another --out")
-    loads, twists = _numbers(loads_g, "--loads-g"), _numbers(twists_deg, "--twists-deg")
+    loads, twists = _numbers(loads_g, "--loads-g", 0.0), _numbers(twists_deg, "--twists-deg", -math.inf)
     if not loads and not twists:
         raise InputError("expected at least one recording, found none; give --loads-g or --twists-deg")
     from rafl.capture import commands
@@ -74,11 +75,17 @@ def render(
     commands.render(specimen, out, loads, twists, frames, fps, material, appearance, codec.value, seed)
 
 
-def _numbers(text: str, option: str) -> list[float]:
+def _numbers(text: str, option: str, low: float) -> list[float]:
+    """The finite numbers of a text, of at least `low`."""
     try:
-        return [float(part) for part in text.split(",") if part.strip()]
+        numbers = [float(part) for part in text.split(",") if part.strip()]
     except ValueError:
         raise InputError(f"{option}: expected numbers separated by commas, found {text!r}") from None
+    for number in numbers:
+        if not math.isfinite(number) or number < low:
+            least = f" of at least {low:g}" if math.isfinite(low) else ""
+            raise InputError(f"{option}: expected finite numbers{least}, found {number:g}")
+    return numbers
 
 
 class Initial(StrEnum):
@@ -167,6 +174,8 @@ def capture(
         )
     require_file(specimen, SPECIMEN)
     require_file(recordings, "a table of recordings (recordings.csv)")
+    if out is not None and out.suffix != ".h5":
+        raise InputError(f"--out: expected the name of a dataset that ends with .h5, found {out}")
     rest_frames = None if rest is None else _rest_frames(rest)
     from rafl.capture import commands
 

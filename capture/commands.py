@@ -1,5 +1,6 @@
 """What `rafl-render` and `rafl-capture` do once their options are checked: call the library, print and write."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,15 +18,16 @@ from rafl.capture.registration.registration import RestPose as RestPose
 from rafl.capture.rendering.film import ENCODINGS, render_video, side_cameras, write_board_images, write_truth
 from rafl.capture.rendering.motion import SimulatedMotion, tip_load_release, twist_release
 from rafl.capture.rendering.render import Appearance, Renderer
-from rafl.capture.report import write_dataset_report
+from rafl.capture.report import dataset_page
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 from rafl.common.command_line import progress
 from rafl.common.errors import InputError, SimulationError
-from rafl.common.files import write_text
+from rafl.common.files import new_content, require_writable, write_text, written_texts
 from rafl.common.kernels import announce_compilation
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
 from rafl.data.markers import Markers
+from rafl.fem.material import modulus_hint
 
 DRAWN_MM = 2.0  # largest distance from the skin of the mesh at which a marker is drawn [mm]
 
@@ -66,10 +68,14 @@ def render(
         InputError: the specimen cannot be read, its markers cannot be drawn, or a motion cannot be simulated.
     """
     announce_compilation()
+    require_writable(out)
     described = read_specimen(specimen)
     described.markers(1e-3 * DRAWN_MM, "or choose smaller elements: dots are drawn on the skin of the elements")
+    for modulus in (described.material.youngs_modulus, true.youngs_modulus):
+        if hint := modulus_hint(modulus):
+            typer.echo(hint, err=True)
     material = replace(described.material, youngs_modulus=true.youngs_modulus, poissons_ratio=true.poissons_ratio)
-    with progress() as bar:
+    with progress() as bar, new_content(out):
         task = bar.add_task("simulating", total=len(loads_g) + len(twists_deg))
         motions: list[SimulatedMotion] = []
         try:
@@ -81,6 +87,7 @@ def render(
                 bar.advance(task)
         except SimulationError as error:
             raise InputError(f"the motion cannot be simulated: {error}") from None
+        motions = _with_distinct_names(motions)
         random = np.random.default_rng(seed)
         rig = side_cameras(described, motions, random)
         write_board_images(out / "calibration", rig, appearance, random)
@@ -90,11 +97,22 @@ def render(
             for view, (name, renderer) in enumerate(renderers.items()):
                 path = out / "videos" / motion.name / f"{name}.{ENCODINGS[codec].suffix}"
                 render_video(path, motion, renderer, fps, codec, seed + 97 * number + view, lambda: bar.advance(task))
-    truth = f"E = {true.youngs_modulus} Pa, nu = {true.poissons_ratio}, density = {material.density} kg/m^3"
-    write_truth(out / "truth.h5", described, motions, rig, truth)
-    write_text(out / "recordings.csv", _recordings_csv(motions))
+        truth = f"E = {true.youngs_modulus} Pa, nu = {true.poissons_ratio}, density = {material.density} kg/m^3"
+        write_truth(out / "truth.h5", described, motions, rig, truth)
+        write_text(out / "recordings.csv", _recordings_csv(motions))
     typer.echo(f"wrote {out}/ (videos/, calibration/, recordings.csv, truth.h5)")
     typer.echo(f"next: rafl-calibrate {out}/calibration --out {out}/calib.yaml")
+
+
+def _with_distinct_names(motions: list[SimulatedMotion]) -> list[SimulatedMotion]:
+    """The motions; from the second of a name on, with a number behind it."""
+    count: Counter[str] = Counter()
+    named = []
+    for motion in motions:
+        count[motion.name] += 1
+        number = count[motion.name]
+        named.append(motion if number == 1 else replace(motion, name=f"{motion.name}-{number}"))
+    return named
 
 
 def _recordings_csv(motions: list[SimulatedMotion]) -> str:
@@ -117,11 +135,12 @@ def capture(
     described = read_specimen(specimen)
     rows = read_recording_rows(recordings)
     path = out or Path("datasets") / f"{described.name}.h5"
+    require_writable(path)
     known = read_dataset(path).markers if update else None
     dataset = _built(described, tracks, rows, settings, recordings, known)
-    (update_dataset if update else write_dataset)(path, dataset)
     report = path.with_suffix(".html")
-    write_dataset_report(report, described, dataset)
+    with written_texts({report: dataset_page(described, dataset)}):
+        (update_dataset if update else write_dataset)(path, dataset)
     Console(width=130).print(recordings_table(dataset))
     for line in warnings(dataset):
         typer.echo(line, err=True)

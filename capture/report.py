@@ -1,14 +1,11 @@
 """Report of a dataset on one page: mesh, recordings, first frames and registration."""
 
-from pathlib import Path
-
 import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 
 from rafl.capture.dataset.summary import warnings
 from rafl.capture.specimen.specimen import Specimen
-from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.data.markers import Markers
 from rafl.evaluation.figures import draw_specimens
@@ -54,14 +51,14 @@ all recordings, and the standard deviation, along x, y and z [mm].</p>
 """
 
 
-def write_dataset_report(path: Path, specimen: Specimen, dataset: Dataset) -> None:
-    """Write the report of a newly built dataset."""
+def dataset_page(specimen: Specimen, dataset: Dataset) -> str:
+    """The report of a newly built dataset, as HTML."""
     plt.switch_backend("agg")
     mesh, items = dataset.simulator.mesh, dataset.trajectories
     filled = float(mesh.volumes.sum()) / specimen.volume
     shown = [(name, item.q, item.markers[0]) for name, item in items.items()][:MAX_FRAMES_SHOWN]
     residuals = {name: np.asarray(item.attributes["fit_markers_mm"], dtype=float) for name, item in items.items()}
-    text = (
+    return (
         jinja2.Environment(autoescape=True)
         .from_string(PAGE)
         .render(
@@ -84,7 +81,6 @@ def write_dataset_report(path: Path, specimen: Specimen, dataset: Dataset) -> No
             registrations=[_registration(name, item.attributes) for name, item in items.items()],
         )
     )
-    write_text(path, text)
 
 
 def _row(name: str, dataset: Dataset) -> list[object]:

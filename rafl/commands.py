@@ -15,8 +15,10 @@ from rich.table import Table
 
 from rafl.common.command_line import create_table, progress
 from rafl.common.errors import InputError, SimulationError
-from rafl.common.files import write_text
+from rafl.common.files import require_writable, written_texts
 from rafl.common.kernels import announce_compilation
+from rafl.common.names import require_names
+from rafl.common.text_tables import spreadsheet_text
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.evaluation.metrics import (
@@ -30,7 +32,7 @@ from rafl.evaluation.metrics import (
     motion_table,
     split_table,
 )
-from rafl.evaluation.report import write_report
+from rafl.evaluation.report import report_page
 from rafl.fitting.auto import SELECTION_FILE, selection_sentences
 from rafl.fitting.distributed import rank
 from rafl.fitting.fit import fit as fit_model
@@ -63,7 +65,8 @@ def fit(
     """
     torch.set_num_threads(TORCH_THREADS)
     announce_compilation()
-    run = out or Path("runs") / f"{read_dataset(paths[0]).name}-{method}"
+    run = out or Path("runs") / _run_name(read_dataset(paths[0]).name, method)
+    require_writable(run)
     first = rank() == 0  # of the processes that torchrun started
     open_writer = partial(_summary_writer(), run) if tensorboard and first else None
     with progress() as bar:
@@ -87,6 +90,11 @@ def fit(
             typer.echo(line)
     typer.echo(f"wrote {run}/ (model.pt, history.csv, config.yaml)")
     typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in paths)}")
+
+
+def _run_name(dataset: str, method: str) -> str:
+    require_names([dataset], "dataset (or give --out)")
+    return f"{dataset}-{method}"
 
 
 def _epoch_report(bar: Progress, task: TaskID, open_writer: Callable[[], Any] | None, first: bool) -> Report:
@@ -170,6 +178,7 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
     """
     torch.set_num_threads(TORCH_THREADS)
     announce_compilation()
+    require_writable(folder)
     models = _models_by_name(runs)
     datasets = [read_dataset(path) for path in files]
     try:
@@ -177,15 +186,20 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
     except SimulationError as error:
         raise _failed_simulation(error) from None
     recordings, splits, motions = error_table(comparisons), split_table(comparisons), motion_table(comparisons)
-    write_text(folder / "errors.csv", recordings.to_csv(index=False, float_format="%.6f"))
-    write_text(folder / "motions.csv", motions.to_csv(index=False, float_format="%.6f"))
-    write_text(folder / "errors.tex", latex_table(splits))
     description = "; ".join(f"{name}: {_describe(model)}" for name, model in models.items())
-    write_report(folder / "report.html", comparisons, splits, recordings, motions, description)
-    Console(width=100).print(_error_table(splits))
+    texts = {
+        "errors.csv": _spreadsheet(recordings),
+        "motions.csv": _spreadsheet(motions),
+        "errors.tex": latex_table(splits),
+        "report.html": report_page(comparisons, splits, recordings, motions, description),
+    }
     transfer = Transfer.of(splits)
     if transfer.errors.shape[1] > 1:
-        write_text(folder / "transfer.csv", transfer.errors.to_csv(float_format="%.6f"))
+        errors = transfer.errors.rename(index=spreadsheet_text, columns=spreadsheet_text)
+        texts["transfer.csv"] = errors.to_csv(float_format="%.6f")
+    with written_texts({folder / name: text for name, text in texts.items()}):
+        pass
+    Console(width=100).print(_error_table(splits))
     for sentence in beyond_training(comparisons, models):
         typer.echo(f"warning: {sentence}", err=True)
     for name, count in transfer.negative_transfers.items():
@@ -200,6 +214,13 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
     else:
         typer.echo("no recording has split `test`, so this error is not of held-out recordings", err=True)
     typer.echo(f"report: {folder / 'report.html'} (open it in a browser)")
+
+
+def _spreadsheet(table: pd.DataFrame) -> str:
+    """A table as CSV; no name in it is a formula."""
+    names = table.select_dtypes(exclude="number")
+    safe = table.assign(**{key: names[key].map(spreadsheet_text) for key in names})
+    return str(safe.to_csv(index=False, float_format="%.6f"))
 
 
 def _error_table(splits: pd.DataFrame) -> Table:

@@ -230,7 +230,9 @@ def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Pat
     with h5py.File(tmp_path / "a.h5", "r+") as file:
         file.attrs["format"] = "rafl-dataset/7"
     assert_refused(run("rafl-fit", "a.h5", "--out", "run"), "rafl-dataset/7", "newer")
-    write_dataset(tmp_path / "a.h5", replace(built, trajectories={}))
+    write_dataset(tmp_path / "a.h5", built)
+    with h5py.File(tmp_path / "a.h5", "r+") as file:
+        del file["trajectories"]
     assert_refused(run("rafl-fit", "a.h5", "--out", "run"), "at least one trajectory")
     tests_only = {name: replace(item, split="test") for name, item in built.trajectories.items()}
     write_dataset(tmp_path / "a.h5", replace(built, trajectories=tests_only))

@@ -26,6 +26,7 @@ from rafl.calibration.summary import camera_table, check_table, perspective_mess
 from rafl.calibration.validation import check_view, write_residual_plot
 from rafl.common.command_line import create_table, progress
 from rafl.common.errors import InputError
+from rafl.common.files import require_writable
 from rafl.common.kernels import announce_compilation
 from rafl.tracking.linking.layout import read_layout
 from rafl.tracking.overlay import write_overlay
@@ -35,7 +36,7 @@ from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 from rafl.tracking.report import summary_cells, write_report
 from rafl.tracking.rest import FACES, open_rest_videos, solve_rest_camera
 from rafl.tracking.video.reader import Video
-from rafl.tracking.video.recordings import find_recordings
+from rafl.tracking.video.recordings import find_videos, open_videos
 
 # Time [s] between two checks for a signal while waiting for a recording: not every signal interrupts the wait.
 SIGNAL_CHECK_S = 1.0
@@ -59,6 +60,7 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
     Raises:
         InputError: a file cannot be read, or the images do not determine the cameras.
     """
+    require_writable(out)
     description = read_board(board)
     views, sizes = board_views(images, description)
     check_shared_world(views)
@@ -91,6 +93,7 @@ def calibrate_from_rest(folder: Path, specimen: Path, face: list[str], tilt_sign
         InputError: a file cannot be read, or the markers do not determine a camera.
     """
     announce_compilation()
+    require_writable(out)
     layout = read_layout(specimen)
     videos = open_rest_videos(folder)
     faces = _values_by_camera("--face", face, list(videos), tuple(FACES))
@@ -206,13 +209,20 @@ def track(
         typer.Exit: some recordings could not be tracked; code 1.
     """
     announce_compilation()
+    require_writable(out)
     rig = read_calibration(calib)
     settings = TrackingSettings(read_layout(specimen) if specimen else None, fps, fill, sync)
     layout = settings.layout
     places = dict(zip(layout.names, layout.positions, strict=True)) if layout else {}
-    recordings = find_recordings(videos, rig, calib)
+    found = find_videos(videos, rig, calib)
+    recordings: dict[str, dict[str, Video]] = {}
     done: dict[str, Tracks] = {}
     failed: dict[str, str] = {}
+    for name, paths in found.items():
+        try:
+            recordings[name] = open_videos(paths, rig)
+        except InputError as error:
+            failed[name] = str(error)
     kept: list[str] = []
     cv2.setNumThreads(1)  # the decoding and tracking threads use the cores; BLAS threads would keep them busy
     sys.setswitchinterval(THREAD_SWITCH_S)
@@ -232,15 +242,13 @@ def track(
                 continue
             if was_there:
                 kept.append(name)
-            if overlay:
-                for camera, video in recordings[name].items():
-                    path = out / f"{name}_{camera}_overlay.mp4"
-                    task = bar.add_task(f"{name}: drawing {camera}", total=len(done[name].time))
-                    tick = partial(bar.advance, task)
-                    write_overlay(path, video, camera, rig.cameras[camera], done[name], tick)
-                    bar.remove_task(task)
-            for kind in exports:
-                WRITERS[kind](out / export_name(kind, name, list(recordings).index(name)), done[name], places)
+            try:
+                if overlay:
+                    _write_overlays(out, name, recordings[name], rig, done[name], bar)
+                for kind in exports:
+                    WRITERS[kind](out / export_name(kind, name, list(found).index(name)), done[name], places)
+            except InputError as error:
+                failed[name] = str(error)
     if not done:
         first = next(iter(failed))
         raise InputError(f"recording {first}: {failed[first]}")
@@ -248,6 +256,17 @@ def track(
     _print_results(out, done, failed, len(kept))
     if failed:
         raise typer.Exit(1)
+
+
+def _write_overlays(out: Path, name: str, videos: dict[str, Video], rig: Rig, tracks: Tracks, bar: Progress) -> None:
+    """Draw the tracks of one recording over the video of each camera."""
+    for camera, video in videos.items():
+        task = bar.add_task(f"{name}: drawing {camera}", total=len(tracks.time))
+        path = out / f"{name}_{camera}_overlay.mp4"
+        try:
+            write_overlay(path, video, camera, rig.cameras[camera], tracks, partial(bar.advance, task))
+        finally:
+            bar.remove_task(task)
 
 
 def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int) -> None:

@@ -1,5 +1,6 @@
 """Overlay videos: each marker with its name and trail drawn over the frames of one camera."""
 
+import io
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -11,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.calibration.camera import Camera
-from rafl.common.files import atomic_file
+from rafl.common.files import write_bytes
 from rafl.tracking.detection.detect import to_eight_bits
 from rafl.tracking.reconstruction.gap_filling import FILLED
 from rafl.tracking.reconstruction.tracks import Tracks
@@ -60,7 +61,8 @@ def write_overlay(
     width, height = (max(int(side * shrink) // 2 * 2, 2) for side in video.size)
     pixel = display_pixels(tracks, name, camera) * shrink
     row_of = tracks.rows_by_frame(name)
-    with atomic_file(path) as temporary, av.open(str(temporary), "w", format="mp4") as output:
+    content = io.BytesIO()
+    with av.open(content, "w", format="mp4") as output:
         stream = output.add_stream("libx264", rate=Fraction(min(tracks.fps, 25.0)).limit_denominator(100))
         stream.width, stream.height, stream.pix_fmt = width, height, "yuv420p"
         for number, frame in enumerate(video.read()):
@@ -73,3 +75,4 @@ def write_overlay(
             image = annotate(small, pixel[row], tracks.state[row] == FILLED, tracks.names, trails)
             output.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
         output.mux(stream.encode())
+    write_bytes(path, content.getbuffer())

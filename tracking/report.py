@@ -21,6 +21,8 @@ from rafl.tracking.reconstruction.tracks import Tracks
 
 Array = NDArray[Any]
 
+plt.rcParams["text.parse_math"] = False  # a name with $ is a name
+
 MAX_WIDTH_PX = 900  # of a frame in the report
 STATE_COLOURS = ["#c0392b", "#4c9f70", "#e6a23c"]  # missing, measured, filled
 

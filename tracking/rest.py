@@ -16,7 +16,7 @@ from rafl.common.errors import InputError
 from rafl.tracking.linking.follow import follow
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.linking.naming import name_by_layout, visible_markers
-from rafl.tracking.video.reader import Video, is_video, natural_key, open_video
+from rafl.tracking.video.reader import Video, is_video, open_video, visible_entries
 
 Array = NDArray[Any]
 
@@ -56,7 +56,7 @@ def open_rest_videos(folder: Path) -> dict[str, Video]:
     """
     if not folder.exists():
         raise InputError(f"expected videos of the specimen at rest at {folder}, found nothing there; check the path")
-    paths = [folder] if is_video(folder) else [p for p in sorted(folder.iterdir(), key=natural_key) if is_video(p)]
+    paths = [folder] if is_video(folder) else [path for path in visible_entries(folder) if is_video(path)]
     if not paths:
         raise InputError(f"expected one video per camera in {folder}, found none; name them <camera>.mp4")
     return {path.name if path.is_dir() else path.stem: open_video(path) for path in paths}

@@ -4,7 +4,6 @@ python -m rafl.capture.dataset.c3d FILE.c3d CONTENT.npz
 """
 
 import resource
-import struct
 import subprocess
 import sys
 import tempfile
@@ -16,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.common.errors import InputError
+from rafl.tracking.reconstruction.export import check_c3d_length
 
 Array = NDArray[Any]
 
-BLOCK_BYTES, MARK, INTEL = 512, 0x50, 84  # bytes of a block; the second byte; the processor of our byte order
-MANY_FRAMES = 65535  # last frame in the header of a file with more
 TIMEOUT = 120.0  # [s]
 MAX_MEMORY_BYTES, MEMORY_PER_BYTE = 2_000_000_000, 40  # for the library, and for each byte of the file
 
@@ -52,7 +50,7 @@ def read_c3d(path: Path) -> C3dContent:
     Raises:
         InputError: the file is cut short or damaged.
     """
-    check_length(path)
+    check_c3d_length(path)
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "content.npz"
         command = [sys.executable, "-m", "rafl.capture.dataset.c3d", str(path), str(out)]
@@ -76,32 +74,6 @@ def read_c3d(path: Path) -> C3dContent:
     if not (np.isfinite(rate) and rate > 0.0):
         raise InputError(f"{path}: expected a frame rate above 0, found {rate:g}; export it again")
     return C3dContent(names, unit, rate, points, residuals, exported)
-
-
-def check_length(path: Path) -> None:
-    """Check that a C3D file is as long as its header says; the library reads a shorter one as if it were whole.
-
-    Raises:
-        InputError: it is shorter, or has no header.
-    """
-    with path.open("rb") as file:
-        head = file.read(BLOCK_BYTES)
-        if len(head) < BLOCK_BYTES or head[1] != MARK or not head[0]:
-            raise InputError(f"expected a C3D file in {path}, found no header of one; export it again")
-        file.seek((head[0] - 1) * BLOCK_BYTES)
-        parameters = file.read(4)
-    if len(parameters) == 4 and parameters[3] != INTEL:
-        return  # numbers in another byte order
-    points, analog, first, last = struct.unpack_from("<4H", head, 2)
-    scale, start = struct.unpack_from("<fH", head, 12)
-    frames = max(last - first + 1, 0) if last < MANY_FRAMES else 0
-    expected = (start - 1) * BLOCK_BYTES + frames * (4 * points + analog) * (4 if scale < 0 else 2)
-    found = path.stat().st_size
-    if found < expected:
-        raise InputError(
-            f"{path}: expected {frames} frames of {points} points ({expected} bytes), found {found} bytes; the file is "
-            "cut short, copy or export it again"
-        )
 
 
 def _extract(source: Path, out: Path) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.common.errors import InputError
-from rafl.common.text_tables import read_table_text
+from rafl.common.text_tables import cell_text, read_table_text
 from rafl.tracking.reconstruction.export import SPECIMEN_FRAME
 
 Array = NDArray[Any]
@@ -140,14 +140,14 @@ def _frame_time(rows: Rows, column: int, rate: float, first: int) -> Array:
 def _read_own_csv(rows: Rows) -> MarkerTable:
     column = {name: k for k, name in enumerate(rows[0])}
     data = [row for row in rows[1:] if any(row)]
-    names = tuple(dict.fromkeys(row[column["marker"]] for row in data))
+    names = tuple(dict.fromkeys(cell_text(row[column["marker"]]) for row in data))
     keys = [f"{axis}_mm" for axis in "xyz"]
     sigma_keys = [f"sigma_{axis}_mm" for axis in "xyz"]
     values = _numbers(data, [column[key] for key in ("frame", "time_s", *keys, *sigma_keys)], 1)
     if not np.isfinite(values[:, :2]).all():
         raise ValueError("expected a frame and a time in every line, found an empty cell")
     frames, index = np.unique(values[:, 0], return_inverse=True)
-    marker = np.array([names.index(row[column["marker"]]) for row in data])
+    marker = np.array([names.index(cell_text(row[column["marker"]])) for row in data])
     position, sigma = (np.full((len(frames), len(names), 3), np.nan) for _ in range(2))
     position[index, marker], sigma[index, marker] = values[:, 2:5], values[:, 5:8]
     time = np.full(len(frames), np.nan)

@@ -25,7 +25,11 @@ def read_marker_names(path: Path) -> dict[str, str]:
     """
     require_file(path, "a table of marker names")
     text, separator, _ = read_table_text(path)
-    rows = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines(), delimiter=separator) if any(row)]
+    try:
+        lines = list(csv.reader(text.splitlines(), delimiter=separator))
+    except csv.Error as error:
+        raise InputError(f"expected a table in {path}, found: {error}; save it as CSV UTF-8") from None
+    rows = [[cell.strip() for cell in row] for row in lines if any(row)]
     if not rows or rows[0] != ["file", "specimen"] or any(len(row) != 2 for row in rows):
         raise InputError(f"{path}: expected a table with the columns file,specimen; found other ones")
     names = dict(row for row in rows[1:])
@@ -82,6 +86,9 @@ def _ordered(recording: Recording, specimen: Specimen, name: str) -> Recording:
                 f"{recording.position.shape[1]}; the file has no names, so its order must be that of the specimen"
             )
         return recording
+    for marker in layout_names:
+        if recording.names.count(marker) > 1:
+            raise InputError(f"recording {name}: expected one marker {marker}, found several; rename the others")
     missing = [marker for marker in layout_names if marker not in recording.names]
     present = [marker for marker in specimen.layout.names if marker in recording.names]
     if len(present) < MIN_MARKERS:

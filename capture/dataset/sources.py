@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 from rafl.capture.dataset.c3d import read_c3d
 from rafl.capture.dataset.marker_tables import METRES, read_marker_table
 from rafl.capture.registration.recording import Recording
+from rafl.common.arrays import ArrayFormat, check_shape, check_values
 from rafl.common.errors import InputError
 from rafl.common.files import sha256
+from rafl.common.names import require_names
 from rafl.tracking.reconstruction.gap_filling import MISSING
 from rafl.tracking.reconstruction.tracks import read_tracks
 
@@ -19,6 +21,13 @@ Array = NDArray[Any]
 # Ends of the names of a recording's files; an earlier one says more about it. DLTdv adds `xyzpts` to a name.
 ENDS = (".h5", ".csv", ".c3d", ".trc", ".tsv", "xyzpts.csv", ".npy")
 ASSUMED_SIGMA = 1e-4  # of files without uncertainties [m]
+MIN_FRAMES = 2
+MAX_SPARSENESS = 100.0  # most frames that a recording may lack for each that it has; more are damage of its times
+RECORDING_FORMATS = {
+    "time": ArrayFormat(("T",)),
+    "position": ArrayFormat(("T", "M", 3), finite=False),
+    "sigma": ArrayFormat(("T", "M", 3), finite=False),
+}
 MAX_COORDINATE = 10.0  # [m]; a larger coordinate shows that the file has another unit
 
 
@@ -26,8 +35,9 @@ def find_sources(folder: Path, recording: str) -> list[Path]:
     """The files of a recording; the first one says most about it.
 
     Raises:
-        InputError: no file.
+        InputError: no file, or a name that leads out of the folder.
     """
+    require_names([recording], "recording")
     if not folder.is_dir():
         raise InputError(f"expected a folder of tracks at {folder}, found none; check the path")
     found = [path for end in ENDS if (path := folder / f"{recording}{end}").is_file()]
@@ -48,8 +58,40 @@ def read_recording(path: Path, fps: float, unit: str | None = None) -> Recording
         unit: of tables that do not name it: m, cm or mm.
 
     Raises:
-        InputError: the file cannot be read, or has another shape.
+        InputError: the file cannot be read, has another shape, or its times or numbers make no recording.
     """
+    recording = _read(path, fps, unit)
+    try:
+        _check(recording)
+    except ValueError as error:
+        raise InputError(f"{path}: {error}; export it again") from None
+    return recording
+
+
+def _check(recording: Recording) -> None:
+    """Raise ValueError unless the arrays of a recording fit each other and its times ascend."""
+    lengths = {} if recording.names is None else {"M": len(recording.names)}
+    for key, expected in RECORDING_FORMATS.items():
+        check_shape(key, getattr(recording, key), expected, lengths)
+        check_values(key, getattr(recording, key), expected)
+    time, position = recording.time, recording.position
+    step = np.diff(time)
+    if len(time) < MIN_FRAMES or not position.size:
+        raise ValueError(f"expected {MIN_FRAMES} frames or more, and markers, found shape {position.shape}")
+    if not (step > 0.0).all():
+        raise ValueError(
+            f"expected times that ascend, found {time[step.argmin() + 1]:g} s after {time[step.argmin()]:g} s"
+        )
+    if time[-1] - time[0] > MAX_SPARSENESS * len(time) * np.median(step):
+        raise ValueError(f"expected frames at an even rate, found {len(time)} of them over {time[-1] - time[0]:g} s")
+    infinite_rest = recording.rest is not None and np.isinf(recording.rest).any()
+    if infinite_rest or np.isinf(position).any() or not np.isfinite(position).any():
+        raise ValueError("expected positions that are finite, or empty where missing, found others")
+    if not (recording.sigma[np.isfinite(position)] > 0.0).all():
+        raise ValueError("expected a sigma above 0 for every position, found another")
+
+
+def _read(path: Path, fps: float, unit: str | None) -> Recording:
     source = f"{path.name} {sha256(path)}"
     if path.suffix == ".h5":
         tracks = read_tracks(path)
@@ -87,17 +129,24 @@ def _read_c3d(path: Path, source: str) -> Recording:
 
 def _read_npy(path: Path, fps: float, source: str) -> Recording:
     try:
-        content = np.load(path, allow_pickle=False)
-    except (OSError, ValueError) as error:
-        raise InputError(f"expected an array in {path}, which cannot be read: {error}; save it again") from None
-    if content.ndim != 3 or content.shape[2] != 3 or len(content) < 3:
+        content = np.lib.format.open_memmap(path, mode="r")  # of arrays only, not larger than the file
+        check_shape("array", content, ArrayFormat(("T", "M", 3)), {})
+        check_values("array", content, ArrayFormat(("T", "M", 3), finite=False))
+    except (OSError, ValueError, SyntaxError, MemoryError, OverflowError) as error:
+        reason = " ".join(str(error).split())
+        raise InputError(
+            f"expected an array (1 + frames, markers, 3) in mm with the rest pose in row 0 in {path}, which cannot be "
+            f"read: {reason:.200}; save it again"
+        ) from None
+    if len(content) < 1 + MIN_FRAMES or not content.size:
         raise InputError(
             f"{path}: expected an array (1 + frames, markers, 3) in mm with the rest pose in row 0, found "
             f"shape {content.shape}; save it in this shape"
         )
-    position = 1e-3 * content.astype(float)
-    if np.nanmax(np.abs(position)) > MAX_COORDINATE:
-        raise InputError(f"{path}: expected mm, found values up to {np.nanmax(np.abs(content)):g}; save it in mm")
+    position = 1e-3 * np.array(content, dtype=float)
+    largest = np.abs(position[np.isfinite(position)]).max(initial=0.0)
+    if largest > MAX_COORDINATE:
+        raise InputError(f"{path}: expected mm, found values up to {1e3 * largest:g}; save it in mm")
     sigma = np.full_like(position[1:], ASSUMED_SIGMA)
     time = np.arange(len(position) - 1) / fps
     rest = position[0] if np.isfinite(position[0]).any() else None

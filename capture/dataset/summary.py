@@ -7,10 +7,12 @@ import h5py
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from rafl.common.command_line import create_table
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
+from rafl.fem.material import modulus_hint
 
 MISPLACED_MM = 2.0  # farther from its description than a hand misplaces a dot: four usual standard deviations
 
@@ -45,6 +47,8 @@ def _number(value: object, format_spec: str) -> str:
 def warnings(dataset: Dataset) -> list[str]:
     """One message for each misplaced marker and each recording in which the registration left markers out."""
     lines = []
+    if hint := modulus_hint(dataset.simulator.material.youngs_modulus):
+        lines.append(f"specimen {dataset.name}: {hint}")
     moved = dataset.markers.moved
     distances = np.zeros(len(dataset.markers.names)) if moved is None else 1e3 * np.linalg.norm(moved, axis=1)
     for name, distance in zip(dataset.markers.names, distances, strict=True):
@@ -89,7 +93,7 @@ def print_contents(path: Path, console: Console) -> None:
     dataset = read_dataset(path)
     simulator, mesh = dataset.simulator, dataset.simulator.mesh
     with h5py.File(path, "r") as file:
-        created, software, units = (str(file.attrs[key]) for key in ("created", "software", "units"))
+        created, software, units = (str(file.attrs.get(key, "-")) for key in ("created", "software", "units"))
     size = 1e3 * np.ptp(mesh.vertices, axis=0)
     material = simulator.material
     lines = {
@@ -105,14 +109,14 @@ def print_contents(path: Path, console: Console) -> None:
         "created": f"{created} by {software}",
     }
     for key, text in lines.items():
-        console.print(f"[bold]{key}[/bold]: {text}", highlight=False)
+        console.print(Text.assemble((key, "bold"), f": {text}"))
     console.print(recordings_table(dataset))
     for name, item in dataset.trajectories.items():
         values = item.attributes
-        console.print(
+        line = (
             f"{name}: registered by {values.get('registration', '-')} ({values.get('registration_markers') or '-'}); "
-            f"first frame from {values.get('first_frame_from', '-')}; source {values.get('source', '-')}",
-            highlight=False,
+            f"first frame from {values.get('first_frame_from', '-')}; source {values.get('source', '-')}"
         )
+        console.print(Text(line))
     for line in warnings(dataset):
-        console.print(line, highlight=False)
+        console.print(Text(line))

@@ -2,7 +2,6 @@
 
 import csv
 import io
-from collections import Counter
 from pathlib import Path
 from typing import Literal
 
@@ -10,8 +9,9 @@ import pydantic
 
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
+from rafl.common.names import Name, require_names
 from rafl.common.text_tables import read_table_text
-from rafl.common.yaml_files import StrictModel
+from rafl.common.yaml_files import StrictModel, describe_validation
 
 
 class RecordingRow(StrictModel):
@@ -21,7 +21,7 @@ class RecordingRow(StrictModel):
     `last_frame` included. Without `first_frame` the start is found from the motion.
     """
 
-    recording: str = pydantic.Field(min_length=1)
+    recording: Name
     load_g: float = pydantic.Field(ge=0)
     split: Literal["train", "val", "test"]
     load: Literal["released", "hanging"] = "released"
@@ -63,12 +63,8 @@ def read_recording_rows(path: Path) -> list[RecordingRow]:
         try:
             rows.append(RecordingRow.model_validate(given))
         except pydantic.ValidationError as error:
-            first = error.errors()[0]
-            column = ".".join(map(str, first["loc"]))
-            raise InputError(f"{path} line {line}, column {column}: {first['msg']}; correct it") from None
+            raise InputError(f"{path} line {line}, column {describe_validation(error)}; correct it") from None
     if not rows:
         raise InputError(f"expected at least one recording in {path}, found none; add a row")
-    repeated = [name for name, count in Counter(row.recording for row in rows).items() if count > 1]
-    if repeated:
-        raise InputError(f"{path}: expected each recording once, found {repeated[0]} twice; remove one row")
+    require_names((row.recording for row in rows), f"{path}, column recording")
     return rows

@@ -1,5 +1,6 @@
 """Synthetic recordings on disk: videos, images of a calibration board, and the ground truth."""
 
+import io
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -23,13 +24,16 @@ from rafl.calibration.rig import PLANE_SIGMA_MM, Rig, rig_text
 from rafl.capture.rendering.motion import SimulatedMotion
 from rafl.capture.rendering.render import Appearance, Renderer, apply_camera_effects, rendered_markers
 from rafl.capture.specimen.specimen import Specimen
-from rafl.common.files import atomic_file, write_text
+from rafl.common.files import write_bytes, write_text
+from rafl.common.hdf5_files import write_hdf5
 
 Array = NDArray[Any]
 
 IMAGE_SIZE = (1280, 720)
 FIELD_OF_VIEW_FACTOR = 1.12  # field of view as a multiple of the extent that the motion sweeps
-SQUARE_MM, MARKER_MM = 10.0, 7.5  # sides on the ChArUco board
+SQUARE_MM, MARKER_SHARE = 10.0, 0.75  # side of a square on the ChArUco board; side of a marker relative to it
+DICTIONARY_MARKERS, MIN_SQUARES = 250, 5  # markers of the dictionary; least squares along a side of the board
+SQUARE_PRINT_PX = 240  # side of a square on the printed board [px]
 BOARD_IMAGES = 12  # per camera
 
 
@@ -123,7 +127,8 @@ def render_video(
             for start in range(0, len(motion.q), 8):
                 yield from pool.map(draw, range(start, min(start + 8, len(motion.q))))
 
-    with atomic_file(path) as temporary, av.open(str(temporary), "w", format=encoding.muxer) as output:
+    content = io.BytesIO()
+    with av.open(content, "w", format=encoding.muxer) as output:
         rate = Fraction(fps).limit_denominator(10000)
         stream = output.add_stream(encoding.encoder, rate=rate)
         stream.width, stream.height = renderer.camera.image_size
@@ -134,6 +139,7 @@ def render_video(
             output.mux(stream.encode(frame))
             tick()
         output.mux(stream.encode())
+    write_bytes(path, content.getbuffer())
 
 
 def write_board_images(folder: Path, rig: Rig, appearance: Appearance, random: np.random.Generator) -> None:
@@ -147,21 +153,13 @@ def write_board_images(folder: Path, rig: Rig, appearance: Appearance, random: n
     pixels_per_metre = min(
         float(np.linalg.norm(camera.projection_jacobian(world_origin)[0])) for camera in rig.cameras.values()
     )
-    columns, rows = (int(0.92 * size / pixels_per_metre / (1e-3 * SQUARE_MM)) for size in IMAGE_SIZE)
-    squares = (columns, rows)
-    pattern = CharucoPattern(
-        kind="charuco",
-        squares=squares,
-        square_mm=SQUARE_MM,
-        marker_mm=MARKER_MM,
-        dictionary="DICT_4X4_250",
-    )
-    print_scale = 24  # print pixels per mm
+    pattern = _board_for(tuple(size / pixels_per_metre for size in IMAGE_SIZE))
+    squares = pattern.squares
+    print_scale = SQUARE_PRINT_PX / pattern.square_mm  # print pixels per mm
     texture = pattern.opencv_board().generateImage(
-        (int(squares[0] * SQUARE_MM * print_scale), int(squares[1] * SQUARE_MM * print_scale)),
-        marginSize=0,
+        (squares[0] * SQUARE_PRINT_PX, squares[1] * SQUARE_PRINT_PX), marginSize=0
     )
-    size = 1e-3 * SQUARE_MM * np.asarray(squares)
+    size = 1e-3 * pattern.square_mm * np.asarray(squares)
     for name, camera in rig.cameras.items():
         assert camera.plane is not None
         axes = np.array(CAMERA_AXES[name])
@@ -189,11 +187,30 @@ def write_board_images(folder: Path, rig: Rig, appearance: Appearance, random: n
                 board = (Rotation.from_rotvec(tilt * tilt_axis) * spin).as_matrix() @ board
                 origin = middle - board @ (size / 2)
             image = _board_image(texture, print_scale, camera, board, origin)
-            path = folder / name / f"{view:02d}.png"
-            with atomic_file(path) as temporary:
-                cv2.imwrite(str(temporary), apply_camera_effects(image, appearance, random))
+            content = cv2.imencode(".png", apply_camera_effects(image, appearance, random))[1]
+            write_bytes(folder / name / f"{view:02d}.png", content.tobytes())
     description = {"format": BOARD_FORMAT, "pattern": pattern.model_dump(mode="json"), "world": world}
     write_text(folder / "board.yaml", yaml.safe_dump(description, sort_keys=False, default_flow_style=None))
+
+
+def _board_for(view: tuple[float, ...]) -> CharucoPattern:
+    """A board that fills most of a view (width, height) [m]: larger squares where the dictionary lacks markers."""
+    square = SQUARE_MM
+    while True:
+        columns, rows = (int(0.92 * 1e3 * size / square) for size in view)
+        if columns * rows > 2 * DICTIONARY_MARKERS:  # every other square has a marker
+            square *= 2.0
+        elif min(columns, rows) < MIN_SQUARES:
+            square /= 2.0
+        else:
+            break
+    return CharucoPattern(
+        kind="charuco",
+        squares=(columns, rows),
+        square_mm=square,
+        marker_mm=MARKER_SHARE * square,
+        dictionary=f"DICT_4X4_{DICTIONARY_MARKERS}",
+    )
 
 
 def _board_image(texture: NDArray[np.uint8], print_scale: float, camera: Camera, board: Array, origin: Array) -> Array:
@@ -216,7 +233,7 @@ def _board_image(texture: NDArray[np.uint8], print_scale: float, camera: Camera,
 def write_truth(path: Path, specimen: Specimen, motions: list[SimulatedMotion], rig: Rig, material_text: str) -> None:
     """Write `truth.h5`: time, marker positions [m], their pixels by camera, and node positions of each recording."""
     markers = rendered_markers(specimen)
-    with atomic_file(path) as temporary, h5py.File(temporary, "w") as file:
+    with write_hdf5(path) as file:
         file.attrs.update({"calibration": rig_text(rig), "material": material_text, "specimen": specimen.text})
         file["marker_names"] = np.array(markers.names, dtype=h5py.string_dtype())
         for motion in motions:

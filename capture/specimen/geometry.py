@@ -5,17 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 from scipy.ndimage import label
 
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
+from rafl.common.names import PathInside
 from rafl.common.yaml_files import StrictModel
 from rafl.fem.mesh import HexMesh
 
 SURFACES = (".stl", ".obj", ".ply")
-MAX_GRID_CELLS = 2_000_000  # of the grid around a surface
+MAX_GRID_CELLS = 2_000_000  # of a box, or of the grid around another shape
 QUERY_SIZE = 50_000  # cell centres per containment query
 
 
@@ -32,7 +33,7 @@ class Geometry(StrictModel):
     cells: tuple[int, int, int] | None = None
     rectangles: list[tuple[int, int]] | None = Field(default=None, min_length=1)
     ellipses: list[tuple[float, float] | tuple[float, float, float]] | None = Field(default=None, min_length=1)
-    surface: str | None = None
+    surface: PathInside | None = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> "Geometry":
@@ -65,8 +66,9 @@ class Geometry(StrictModel):
         """
         if self.box_mm is not None:
             size = 1e-3 * np.array(self.box_mm)
-            cells = self.cells or np.round(size / (1e-3 * (self.element_mm or 1.0))).astype(int)
-            return Solid(HexMesh.box(cells, size), float(size.prod()))
+            cells = np.array(self.cells or np.round(size / (1e-3 * (self.element_mm or 1.0))), dtype=float)
+            _check_count("geometry", cells)
+            return Solid(HexMesh.box(cells.astype(int), size), float(size.prod()))
         element = 1e-3 * (self.element_mm or 1.0)
         if self.surface is not None:
             return fill_surface(folder / self.surface, element, clamp)
@@ -82,9 +84,20 @@ class Solid:
     volume: float
 
 
+def _check_count(label: str, cells: ArrayLike) -> None:
+    """Raise InputError for more cells (x, y, z) than a computer can simulate."""
+    count = float(np.prod(np.asarray(cells, dtype=float)))
+    if not count <= MAX_GRID_CELLS:
+        raise InputError(
+            f"{label}: expected at most {MAX_GRID_CELLS} elements, found {count:.6g}; choose a larger element_mm (and "
+            "are all lengths in mm?)"
+        )
+
+
 def _rectangle_grid(sections: list[tuple[int, int]]) -> NDArray[np.bool_]:
     """Which cells of a grid (X, Y, Z) the sections fill, centred."""
     width, height = max(w for w, _ in sections), max(h for _, h in sections)
+    _check_count("rectangles", (len(sections), width, height))
     grid = np.zeros((len(sections), width, height), dtype=bool)
     for x, (w, h) in enumerate(sections):
         grid[x, (width - w) // 2 : (width + w) // 2, (height - h) // 2 : (height + h) // 2] = True
@@ -94,6 +107,7 @@ def _rectangle_grid(sections: list[tuple[int, int]]) -> NDArray[np.bool_]:
 def _ellipse_grid(sections: list[tuple[float, float] | tuple[float, float, float]]) -> NDArray[np.bool_]:
     """Which cells of a grid (X, Y, Z) have their centres inside the sections."""
     half_width, half_height = (int(max(axes[k] for axes in sections)) for k in (0, 1))
+    _check_count("ellipses", (len(sections), 2 * half_width + 1, 2 * half_height + 1))
     y, z = np.arange(-half_width, half_width + 1)[:, None], np.arange(-half_height, half_height + 1)
     centre = [axes[2] if len(axes) == 3 else 0.0 for axes in sections]
     return np.array(
@@ -117,12 +131,9 @@ def fill_surface(path: Path, element: float, clamp: str) -> Solid:
     """
     surface = read_surface(path)
     low, high = 1e-3 * surface.bounds
-    count = np.maximum(np.ceil((high - low) / element - 1e-6), 1.0).astype(int)
-    if count.prod() > MAX_GRID_CELLS:
-        raise InputError(
-            f"surface {path}: expected at most {MAX_GRID_CELLS} elements around it, found {count.prod()} of "
-            f"{1e3 * element:g} mm in {' x '.join(f'{x:.4g}' for x in 1e3 * (high - low))} mm; is the file in mm?"
-        )
+    cells = np.maximum(np.ceil((high - low) / element - 1e-6), 1.0)
+    _check_count(f"surface {path}, {' x '.join(f'{x:.4g}' for x in 1e3 * (high - low))} mm", cells)
+    count = cells.astype(int)
     origin = 0.5 * (low + high) - 0.5 * element * count
     axis = "xyz".index(clamp[0])
     origin[axis] = low[axis] if clamp.endswith("min") else high[axis] - element * count[axis]
@@ -137,6 +148,11 @@ def fill_surface(path: Path, element: float, clamp: str) -> Solid:
             "element_mm (and is the file in mm?)"
         )
     pieces = label(inside)[1]
+    bodies = surface.body_count
+    if 1 < bodies <= pieces:
+        raise InputError(
+            f"surface {path}: expected one body, found {bodies} that do not touch; join them, or export one of them"
+        )
     if pieces > 1:
         raise InputError(
             f"surface {path}: expected elements in one piece, found {pieces} pieces of {1e3 * element:g} mm elements; "
@@ -157,11 +173,13 @@ def read_surface(path: Path) -> trimesh.Trimesh:
         raise InputError(f"expected a surface ({', '.join(SURFACES)}), found {path}; export it in one of these")
     try:
         surface = trimesh.load_mesh(path, skip_materials=True)
-    except (ValueError, IndexError, KeyError, TypeError, AttributeError, ImportError) as error:
+    except Exception as error:  # its readers raise many kinds on damaged files; all mean the same to the user
         reason = " ".join(str(error).split())
         raise InputError(
             f"expected a surface in {path}, which cannot be read: {reason:.120}; export it again"
         ) from None
+    if isinstance(surface, trimesh.Trimesh) and not np.isfinite(surface.vertices).all():
+        raise InputError(f"surface {path}: expected finite coordinates, found others; export it again")
     if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise InputError(f"expected triangles in {path}, found none; export it again as a mesh")
     if not surface.is_watertight:

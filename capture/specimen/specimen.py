@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, model_validator
 
 from rafl.capture.specimen.geometry import Geometry
 from rafl.common.errors import InputError
+from rafl.common.names import Name
 from rafl.common.yaml_files import StrictModel, read_yaml
 from rafl.data.markers import Markers, embed, embedding_gap
 from rafl.fem.laws import LAWS
@@ -100,7 +101,7 @@ class _Load(StrictModel):
 
 class _SpecimenFile(StrictModel):
     format: str
-    name: str = Field(pattern=r"^[\w.-]+$")
+    name: Name
     geometry: Geometry
     material: _Material
     clamp: _Clamp

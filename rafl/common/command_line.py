@@ -1,14 +1,17 @@
 """Code that all commands share: error reports, application settings, progress bars."""
 
 import functools
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import ParamSpec, TypeVar
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 from rafl.common.errors import InputError
 
@@ -16,29 +19,67 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
+class _Terminated(KeyboardInterrupt):
+    """The system asks the program to end (SIGTERM). What follows Ctrl-C follows: temporary files are removed."""
+
+
 def report_errors(command: Callable[P, R]) -> Callable[P, R]:
     """Wrap a command so that it reports errors in one line on standard error instead of a traceback.
 
-    The exit code is 2 after an `InputError` or an error of the file system, and 130 after an interruption.
+    The exit code is 2 after an `InputError`, an error of the file system or too little memory, 130 after Ctrl-C, and
+    143 after SIGTERM.
     """
 
     @functools.wraps(command)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
-            return command(*args, **kwargs)
+            with _ended_by_sigterm():
+                return command(*args, **kwargs)
         except InputError as error:
-            typer.echo(f"error: {error}", err=True)
-            raise typer.Exit(2) from None
+            raise _failure(f"error: {error}", 2) from None
         except OSError as error:
             path = error.filename or "a file"
             reason = error.strerror or error
-            typer.echo(f"error: {path}: {reason}; check the path, its permissions and the disk", err=True)
-            raise typer.Exit(2) from None
-        except KeyboardInterrupt:
-            typer.echo("interrupted; no incomplete file was left", err=True)
-            raise typer.Exit(130) from None
+            message = f"error: {path}: {reason}; check the path, its permissions and the space on the disk"
+            raise _failure(message, 2) from None
+        except MemoryError:
+            message = "error: expected more free memory; end other programs, or use fewer recordings or a coarser mesh"
+            raise _failure(message, 2) from None
+        except KeyboardInterrupt as error:
+            message = "interrupted; no incomplete file was left"
+            raise _failure(message, 143 if isinstance(error, _Terminated) else 130) from None
 
     return wrapped
+
+
+def _failure(message: str, code: int) -> typer.Exit:
+    typer.echo(one_line(message), err=True)
+    return typer.Exit(code)
+
+
+def one_line(text: str) -> str:
+    """A text in one line of visible characters; others, as names from files may have, as escape sequences."""
+    parts = (part if part.isprintable() else part.encode("unicode_escape").decode() for part in " ".join(text.split()))
+    return "".join(parts)
+
+
+@contextmanager
+def _ended_by_sigterm() -> Iterator[None]:
+    """Let SIGTERM raise `_Terminated`, once, unless the program that started this one has chosen otherwise."""
+    in_main = threading.current_thread() is threading.main_thread()
+    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+        yield
+        return
+
+    def terminate(number: int, frame: object) -> None:
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # nothing interrupts the removal of temporary files
+        raise _Terminated
+
+    signal.signal(signal.SIGTERM, terminate)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def create_app(help_text: str) -> typer.Typer:
@@ -55,15 +96,22 @@ def create_app(help_text: str) -> typer.Typer:
 def progress() -> Progress:
     """A progress bar on standard error, so that standard output holds results only."""
     return Progress(
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        console=Console(stderr=True),
+        console=Console(stderr=True, markup=False),
         transient=True,
     )
 
 
-def create_table(*headings: str, title: str | None = None) -> Table:
-    """A table for the terminal. Headings and title are shown as they are: rich takes "[px]" for a style."""
-    return Table(*map(escape, headings), title=title and escape(title))
+class _PlainTable(Table):
+    """A table whose text is shown as it is: rich would take `[px]` for a style and `:eye:` for a picture."""
+
+    def add_row(self, *cells: str) -> None:  # type: ignore[override]  # of text only
+        super().add_row(*map(Text, cells))
+
+
+def create_table(*headings: str, title: str | None = None) -> _PlainTable:
+    """A table for the terminal. Headings, cells and title are shown as they are."""
+    return _PlainTable(*(Column(Text(heading)) for heading in headings), title=None if title is None else Text(title))

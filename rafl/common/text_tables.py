@@ -6,6 +6,7 @@ from pathlib import Path
 from rafl.common.errors import InputError
 
 SEPARATORS = ",;\t"
+FORMULA_STARTS = ("=", "+", "-", "@")
 
 
 def read_table_text(path: Path) -> tuple[str, str, int]:
@@ -25,3 +26,13 @@ def read_table_text(path: Path) -> tuple[str, str, int]:
     if named:
         return text[named.end() :], named["separator"], 1
     return text, max(SEPARATORS, key=text.partition("\n")[0].count), 0
+
+
+def spreadsheet_text(text: str) -> str:
+    """A cell's text that no spreadsheet takes for a formula: one that begins like a formula gets an apostrophe."""
+    return f"'{text}" if text.startswith(FORMULA_STARTS) else text
+
+
+def cell_text(text: str) -> str:
+    """The text from which `spreadsheet_text` made a cell."""
+    return text[1:] if text.startswith("'") and text[1:].startswith(FORMULA_STARTS) else text

@@ -1,5 +1,6 @@
 """One specimen's mesh, markers and recorded trajectories."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -7,6 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rafl.common.arrays import ArrayFormat, check_shape, check_values
+from rafl.common.names import check_distinct, check_names, check_visible
 from rafl.data.markers import Markers
 from rafl.simulation.rollout import Start
 from rafl.simulation.simulator import Simulator
@@ -17,6 +20,29 @@ SPLITS = ("train", "val", "test")
 THROUGH_MODEL = "through the model"  # begins the description of a registration that rests on the assumed material
 # Largest relative error of frame times against an even time grid, and of one recording's time step against another's.
 MAX_RELATIVE_TIME_ERROR = 5e-3
+# The arrays of a dataset and of its file. N: nodes, E: elements, F: fixed nodes, M: markers, T: frames.
+MESH_ARRAYS = {
+    "vertices": ArrayFormat(("N", 3)),
+    "hexes": ArrayFormat(("E", 8), "integer", low=0),
+    "fixed": ArrayFormat(("F",), "integer", low=0),
+}
+MARKER_ARRAYS = {
+    "rest": ArrayFormat(("M", 3)),
+    "quad": ArrayFormat(("M", 4), "integer", low=0),
+    "weights": ArrayFormat(("M", 4)),
+    "normal_offset": ArrayFormat(("M",)),
+    "moved": ArrayFormat(("M", 3), optional=True),  # of markers whose places were found, not as described
+    "place_sigma": ArrayFormat(("M", 3), low=0.0, optional=True),
+}
+RECORDING_ARRAYS = {
+    "time": ArrayFormat(("T",)),
+    "markers": ArrayFormat(("T", "M", 3), finite=False),
+    "valid": ArrayFormat(("T", "M"), "truth"),
+    "sigma": ArrayFormat(("T", "M", 3), finite=False, low=0.0),
+    "load": ArrayFormat(("N", 3)),
+    "added_mass": ArrayFormat(("N",), low=0.0),
+}
+INITIAL_ARRAYS = dict.fromkeys(("q", "v", "virtual_force"), ArrayFormat(("N", 3)))
 
 
 @dataclass(frozen=True)
@@ -100,39 +126,62 @@ class Dataset:
         Raises:
             ValueError: a part is not; names it.
         """
-        mesh, nodes = self.simulator.mesh, len(self.simulator.mesh.vertices)
-        _require(bool(np.isfinite(mesh.vertices).all()), "mesh/vertices", "finite numbers")
-        _require(_indices_valid(mesh.hexes, nodes), "mesh/hexes", f"vertices from 0 to {nodes - 1}")
-        _require(_indices_valid(self.simulator.fixed, nodes), "mesh/fixed", f"vertices from 0 to {nodes - 1}")
-        _require(_indices_valid(self.markers.quad, nodes), "markers/quad", f"vertices from 0 to {nodes - 1}")
+        self._check_names()
+        mesh, lengths = self.simulator.mesh, {"M": len(self.markers.names)}
+        arrays = {"vertices": mesh.vertices, "hexes": mesh.hexes, "fixed": self.simulator.fixed}
+        _check_arrays("mesh/", arrays, MESH_ARRAYS, lengths)
+        _check_arrays("markers/", vars(self.markers), MARKER_ARRAYS, lengths)
+        nodes = len(mesh.vertices)
+        for label, indices in (("hexes", mesh.hexes), ("fixed", self.simulator.fixed), ("quad", self.markers.quad)):
+            _require(bool((indices < nodes).all()), label, f"vertices from 0 to {nodes - 1}")
+        _require(mesh.quadrature.volume.size > 0, "mesh/hexes", "one cell or more")  # none of them inverted
         error = np.abs(self.markers.weights.sum(axis=1) - 1.0)
         _require(bool((error < 1e-9).all()), "markers/weights", "weights that add up to 1")
+        embedded = self.markers.positions(torch.from_numpy(mesh.vertices))
+        _require(bool(embedded.isfinite().all()), "markers/quad", "four different vertices of a face")
         for name, item in self.trajectories.items():
-            self._check_trajectory(f"trajectories/{name}", item)
+            self._check_trajectory(f"trajectories/{name}", item, {**lengths})
 
-    def _check_trajectory(self, label: str, item: Trajectory) -> None:
-        nodes, frames, count = len(self.simulator.mesh.vertices), len(item.time), len(self.markers.names)
-        shapes = {"markers": (frames, count, 3), "valid": (frames, count), "sigma": (frames, count, 3)}
-        shapes |= dict.fromkeys(("q", "v", "virtual_force", "load"), (nodes, 3)) | {"added_mass": (nodes,)}
-        for key, shape in shapes.items():
-            value = getattr(item, key)
-            _require(value.shape == shape, f"{label}/{key}", f"shape {shape}, found {value.shape}")
-            if key not in ("markers", "valid", "sigma"):
-                _require(bool(np.isfinite(value).all()), f"{label}/{key}", "finite numbers")
+    def _check_names(self) -> None:
+        """Recordings name parts of the file. The other names are only printed, and older files have any."""
+        try:
+            check_names(self.trajectories)
+        except ValueError as reason:
+            raise ValueError(f"recordings: {reason}") from None
+        for label, names in (("name", [self.name]), ("markers", self.markers.names)):
+            try:
+                for name in names:
+                    check_visible(name)
+                check_distinct(names)
+            except ValueError as reason:
+                raise ValueError(f"{label}: {reason}") from None
+
+    def _check_trajectory(self, label: str, item: Trajectory, lengths: dict[str, int]) -> None:
+        _check_arrays(f"{label}/", vars(item), RECORDING_ARRAYS | INITIAL_ARRAYS, lengths)
+        frames = len(item.time)
         grid = self.simulator.time_step * np.arange(frames)
         steps = np.maximum(np.arange(frames), 1)
         even = np.abs(item.time - grid) <= MAX_RELATIVE_TIME_ERROR * self.simulator.time_step * steps
         _require(frames > 1 and bool(even.all()), f"{label}/time", "two or more even times from 0 on")
         observed = item.markers[item.valid]
+        _require(bool(item.valid.any()), f"{label}/valid", "a marker that is seen, found none in any frame")
         _require(bool(np.isfinite(observed).all()), f"{label}/markers", "finite positions where valid")
         _require(bool((item.sigma[item.valid] > 0).all()), f"{label}/sigma", "more than 0 where valid")
         _require(item.split in SPLITS, f"{label}, split", f"{', '.join(SPLITS)}, found {item.split!r}")
 
 
+def _check_arrays(
+    label: str, arrays: Mapping[str, Any], formats: Mapping[str, ArrayFormat], lengths: dict[str, int]
+) -> None:
+    """Raise ValueError for an array that differs from its description, or is missing."""
+    for key, expected in formats.items():
+        array = arrays[key]
+        if array is None and expected.optional:
+            continue
+        check_shape(f"{label}{key}", array, expected, lengths)
+        check_values(f"{label}{key}", array, expected)
+
+
 def _require(condition: bool, label: str, expected: str) -> None:
     if not condition:
         raise ValueError(f"{label}: expected {expected}")
-
-
-def _indices_valid(values: NDArray[np.int64], count: int) -> bool:
-    return bool(((values >= 0) & (values < count)).all())

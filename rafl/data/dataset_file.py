@@ -8,13 +8,24 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pydantic
 from numpy.typing import NDArray
 
+from rafl.common.arrays import ArrayFormat, read_arrays
 from rafl.common.errors import InputError
-from rafl.common.files import atomic_file, require_file
+from rafl.common.hdf5_files import read_hdf5, write_hdf5
+from rafl.common.names import require_names
 from rafl.common.version import VERSION
 from rafl.common.yaml_files import check_format
-from rafl.data.dataset import MAX_RELATIVE_TIME_ERROR, Dataset, Trajectory
+from rafl.data.dataset import (
+    INITIAL_ARRAYS,
+    MARKER_ARRAYS,
+    MAX_RELATIVE_TIME_ERROR,
+    MESH_ARRAYS,
+    RECORDING_ARRAYS,
+    Dataset,
+    Trajectory,
+)
 from rafl.data.markers import Markers
 from rafl.fem.laws import LAWS
 from rafl.fem.material import Material
@@ -27,8 +38,7 @@ FORMAT = "rafl-dataset/1"
 UNITS = "SI: m, s, kg, N, Pa; specimen frame: origin at a corner of the clamped face, x to the tip, z up"
 SPECIMEN_GROUPS = ("mesh", "material", "markers")  # groups that all recordings share
 HASH_ATTRIBUTE = "sha256"
-MARKER_ARRAYS = ("rest", "quad", "weights", "normal_offset")
-FOUND_ARRAYS = ("moved", "place_sigma")  # of markers whose places were found; missing in files of markers as described
+LABEL, ADVICE = "a dataset written by rafl-capture", "build it again"  # in messages about unreadable files
 # Unit and frame of every array, by its name. The hashes cover these texts: changing one breaks updates of older files.
 UNITS_AND_FRAMES = {
     "vertices": ("m", "specimen, at rest"),
@@ -56,11 +66,14 @@ def write_dataset(path: str | Path, dataset: Dataset) -> None:
     """Write a dataset file atomically.
 
     Raises:
+        InputError: the name of the specimen or a marker does not suit files, or the file cannot be written.
         ValueError: parts of the dataset are inconsistent.
     """
     path = Path(path)
     dataset.check()
-    with atomic_file(path) as temporary, h5py.File(temporary, "w") as file:
+    require_names([dataset.name], "dataset")
+    require_names(dataset.markers.names, f"dataset {dataset.name}, markers")
+    with write_hdf5(path, read_dataset) as file:
         _write(file, dataset, dataset.recipe)
 
 
@@ -86,7 +99,7 @@ def update_dataset(path: Path, dataset: Dataset) -> None:
             )
     dataset = replace(dataset, simulator=replace(other, time_step=own.time_step))
     dataset.check()
-    with atomic_file(path) as temporary, h5py.File(temporary, "w") as file, h5py.File(path, "r") as old:
+    with write_hdf5(path, read_dataset) as file, read_hdf5(path, LABEL, ADVICE) as old:
         _write(file, dataset, f"{earlier.recipe}\n# then\n{dataset.recipe}")
         for part in SPECIMEN_GROUPS:
             if file[part].attrs[HASH_ATTRIBUTE] != _digest(old[part]):
@@ -120,15 +133,15 @@ def _write(file: h5py.File, dataset: Dataset, recipe: str) -> None:
     _write_array(file, "mesh/fixed", simulator.fixed)
     # Files of materials without branches stay as they were before there were branches, so that they can be updated.
     file.create_group("material").attrs.update({key: x for key, x in vars(simulator.material).items() if x != ()})
-    for key in (*MARKER_ARRAYS, *FOUND_ARRAYS):
+    for key in MARKER_ARRAYS:
         if getattr(markers, key) is not None:
             _write_array(file, f"markers/{key}", getattr(markers, key))
     file["markers/names"] = np.array(markers.names, dtype=h5py.string_dtype())
     file.create_group("trajectories")
     for name, item in dataset.trajectories.items():
-        for key in ("time", "markers", "valid", "sigma", "load", "added_mass"):
+        for key in RECORDING_ARRAYS:
             _write_array(file, f"trajectories/{name}/{key}", getattr(item, key))
-        for key in ("q", "v", "virtual_force"):
+        for key in INITIAL_ARRAYS:
             _write_array(file, f"trajectories/{name}/initial/{key}", getattr(item, key))
         file[f"trajectories/{name}"].attrs.update({"split": item.split, **item.attributes})
     for group in (*(file[part] for part in SPECIMEN_GROUPS), *file["trajectories"].values()):
@@ -171,30 +184,19 @@ def damaged_parts(path: Path) -> list[str]:
     Raises:
         InputError: no dataset file, or one without hashes.
     """
-    require_file(path, "a dataset (.h5)")
     damaged = []
-    try:
-        with h5py.File(path, "r") as file:
-            check_format(str(file.attrs.get("format", "")), FORMAT, path)
-            for name in ("/", *SPECIMEN_GROUPS, *(f"trajectories/{name}" for name in file["trajectories"])):
-                if HASH_ATTRIBUTE not in file[name].attrs:
-                    raise InputError(f"expected hashes in {path}, found none for {name}; build it again")
-                try:
-                    intact = file[name].attrs[HASH_ATTRIBUTE] == _digest(file[name], deep=name != "/")
-                except OSError:  # HDF5 verifies a checksum of its own
-                    intact = False
-                if not intact:
-                    damaged.append(name)
-    except (OSError, KeyError, RuntimeError) as error:
-        raise _unreadable_error(path, error) from None
+    with read_hdf5(path, LABEL, ADVICE) as file:
+        check_format(str(file.attrs.get("format", "")), FORMAT, path)
+        for name in ("/", *SPECIMEN_GROUPS, *(f"trajectories/{name}" for name in file["trajectories"])):
+            if HASH_ATTRIBUTE not in file[name].attrs:
+                raise InputError(f"expected hashes in {path}, found none for {name}; build it again")
+            try:
+                intact = file[name].attrs[HASH_ATTRIBUTE] == _digest(file[name], deep=name != "/")
+            except OSError:  # HDF5 verifies a checksum of its own
+                intact = False
+            if not intact:
+                damaged.append(name)
     return damaged
-
-
-def _unreadable_error(path: Path, error: Exception) -> InputError:
-    reason = " ".join(str(error).split())
-    return InputError(
-        f"expected a dataset written by rafl-capture in {path}, which cannot be read: {reason}; build it again"
-    )
 
 
 def read_dataset(path: str | Path) -> Dataset:
@@ -205,14 +207,10 @@ def read_dataset(path: str | Path) -> Dataset:
             whose law is not registered.
     """
     path = Path(path)
-    require_file(path, "a dataset (.h5)")
-    try:
-        with h5py.File(path, "r") as file:
-            check_format(str(file.attrs.get("format", "")), FORMAT, path)
-            dataset = _read(file)
+    with read_hdf5(path, LABEL, ADVICE) as file:
+        check_format(str(file.attrs.get("format", "")), FORMAT, path)
+        dataset = _read(file)
         dataset.check()
-    except (OSError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise _unreadable_error(path, error) from None
     if not dataset.trajectories:
         raise InputError(f"expected at least one trajectory in {path}, found none; run rafl-capture again")
     return dataset
@@ -220,34 +218,65 @@ def read_dataset(path: str | Path) -> Dataset:
 
 def _read(file: h5py.File) -> Dataset:
     material = _attributes(file["material"])
-    if material["law"] not in LAWS:
+    if material["law"] not in tuple(LAWS):
         raise InputError(
             f"expected one of the laws {', '.join(LAWS)} in {file.filename}, found {material['law']!r}; "
             "register it first, in Python, with rafl.register_law"
         )
-    gx, gy, gz = (float(g) for g in file.attrs["gravity"])
+    about = _FileAttributes.model_validate(_attributes(file))
+    lengths: dict[str, int] = {}
+    mesh = read_arrays(file["mesh"], MESH_ARRAYS, lengths, "mesh/")
     simulator = Simulator(
-        HexMesh(file["mesh/vertices"][()], file["mesh/hexes"][()]),
+        HexMesh(mesh["vertices"], mesh["hexes"]),
         Material(**material),
-        file["mesh/fixed"][()],
-        float(file.attrs["time_step"]),
-        (gx, gy, gz),
-        str(file.attrs.get("integrator", "implicit-euler")),
-        int(file.attrs.get("substeps", 1)),
+        mesh["fixed"],
+        about.time_step,
+        about.gravity,
+        about.integrator,
+        about.substeps,
     )
-    keys = (*MARKER_ARRAYS, *(key for key in FOUND_ARRAYS if key in file["markers"]))
-    names = tuple(name.decode() for name in file["markers/names"][()])
-    markers = Markers(names, **{key: file[f"markers/{key}"][()] for key in keys})
+    arrays = {"names": ArrayFormat(("M",), "text")} | MARKER_ARRAYS
+    markers = Markers(**read_arrays(file["markers"], arrays, lengths, "markers/"))
     trajectories = {
-        name: Trajectory(
-            **{key: group[key][()] for key in ("time", "markers", "valid", "sigma", "load", "added_mass")},
-            **{key: group["initial"][key][()] for key in ("q", "v", "virtual_force")},
-            split=str(group.attrs["split"]),
-            attributes={key: value for key, value in _attributes(group).items() if key != "split"},
-        )
+        name: _read_trajectory(group, {**lengths}, f"trajectories/{name}/")
         for name, group in file.get("trajectories", {}).items()
     }
-    return Dataset(str(file.attrs["name"]), simulator, markers, trajectories, str(file.attrs["recipe"]))
+    return Dataset(about.name, simulator, markers, trajectories, about.recipe)
+
+
+class _FileAttributes(pydantic.BaseModel):
+    """Attributes of the file that are needed to simulate."""
+
+    model_config = pydantic.ConfigDict(allow_inf_nan=False)
+
+    name: str
+    recipe: str
+    time_step: float = pydantic.Field(gt=0)
+    gravity: tuple[float, float, float]
+    integrator: str = "implicit-euler"
+    substeps: int = pydantic.Field(default=1, ge=1)
+
+
+class _RecordingAttributes(pydantic.BaseModel):
+    """Attributes of a recording that are used. Others are kept as they are."""
+
+    model_config = pydantic.ConfigDict(extra="allow", allow_inf_nan=False)
+
+    split: str
+    load_g: float | None = pydantic.Field(None, ge=0)
+    still_frames: int = pydantic.Field(0, ge=0)
+    registration: str = ""
+
+
+def _read_trajectory(group: h5py.Group, lengths: dict[str, int], label: str) -> Trajectory:
+    attributes = _attributes(group)
+    _RecordingAttributes.model_validate(attributes)
+    return Trajectory(
+        **read_arrays(group, RECORDING_ARRAYS, lengths, label),
+        **read_arrays(group["initial"], INITIAL_ARRAYS, lengths, f"{label}initial/"),
+        split=attributes.pop("split"),
+        attributes=attributes,
+    )
 
 
 def _attributes(group: h5py.Group) -> dict[str, Any]:

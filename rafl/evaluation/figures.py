@@ -14,6 +14,8 @@ from rafl.fem.mesh import HexMesh
 
 Array = NDArray[Any]
 
+plt.rcParams["text.parse_math"] = False  # a name with $ is a name
+
 
 def encode_png(figure: Figure) -> str:
     """Return the figure as a PNG in base64 text, and close it."""

@@ -246,7 +246,7 @@ def latex_table(splits: pd.DataFrame) -> str:
     test = test if len(test) else splits
     methods = list(dict.fromkeys(test["method"]))
     lines = [r"\begin{tabular}{l" + "c" * len(methods) + "}", r"\toprule"]
-    lines += ["Dataset & " + " & ".join(methods) + r" \\", r"\midrule"]
+    lines += ["Dataset & " + " & ".join(map(_latex_text, methods)) + r" \\", r"\midrule"]
     for dataset, group in test.groupby("dataset", sort=False):
         means, stds = (dict(zip(group["method"], group[key], strict=True)) for key in ("mean_mm", "std_mm"))
         cells = []
@@ -258,8 +258,21 @@ def latex_table(splits: pd.DataFrame) -> str:
             cell = rf"\mathbf{{{cell}}}" if means[method] == min(means.values()) else cell
             cell = rf"\underline{{{cell}}}" if means[method] < means[BASELINE] else cell
             cells.append(f"${cell}$")
-        lines.append(f"{dataset} & " + " & ".join(cells) + r" \\")
+        lines.append(f"{_latex_text(str(dataset))} & " + " & ".join(cells) + r" \\")
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
+
+
+LATEX_CHARACTERS = {
+    **{character: f"\\{character}" for character in "&%$#_{}"},
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+}
+
+
+def _latex_text(text: str) -> str:
+    """A name as LaTeX prints it: characters with a meaning of their own are escaped."""
+    return "".join(LATEX_CHARACTERS.get(character, character) for character in text)
 
 
 def held_out_errors(comparisons: list[Comparison]) -> dict[str, float]:

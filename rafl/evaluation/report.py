@@ -1,14 +1,12 @@
 """`report.html` of an evaluation: one file that contains all tables and plots."""
 
 from itertools import cycle
-from pathlib import Path
 
 import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 
-from rafl.common.files import write_text
 from rafl.evaluation.figures import draw_residual_forces, draw_specimens, encode_png
 from rafl.evaluation.metrics import BASELINE, Comparison, Transfer
 from rafl.evaluation.oscillation import most_active_coordinate
@@ -170,18 +168,16 @@ def _force_image(items: list[Comparison]) -> str:
     return draw_residual_forces(items[0].mesh, mean) if mean else ""
 
 
-def write_report(
-    path: Path,
+def report_page(
     comparisons: list[Comparison],
     splits: pd.DataFrame,
     recordings: pd.DataFrame,
     motions: pd.DataFrame,
     models: str,
-) -> None:
-    """Write `report.html`.
+) -> str:
+    """The page `report.html`.
 
     Args:
-        path: HTML file to write.
         comparisons: simulations to plot.
         splits: from `split_table`.
         recordings: from `error_table`.
@@ -194,7 +190,7 @@ def write_report(
         by_dataset.setdefault(item.dataset, []).append(item)
     shown = sorted(comparisons, key=lambda item: item.split != "test")[:MAX_MARKER_PLOTS]
     page = jinja2.Environment(autoescape=True).from_string(PAGE)
-    text = page.render(
+    return page.render(
         methods=list(dict.fromkeys(splits["method"])),
         transfer=_transfer_rows(Transfer.of(splits)),
         motions=_motion_rows(motions),
@@ -207,4 +203,3 @@ def write_report(
         left_out=len(comparisons) - len(shown),
         models=models,
     )
-    write_text(path, text)

@@ -33,6 +33,19 @@ def lame(youngs_modulus: Any, poissons_ratio: Any) -> tuple[Any, Any]:
     return mu, lam
 
 
+SOFTEST = 1e3  # Young's modulus [Pa] below which no silicone is; the softest on sale have some 10 kPa
+
+
+def modulus_hint(youngs_modulus: float) -> str:
+    """A sentence about a Young's modulus [Pa] that looks as if it were given in kPa or MPa; else empty."""
+    if youngs_modulus >= SOFTEST:
+        return ""
+    return (
+        f"Young's modulus {youngs_modulus:g} Pa is below {SOFTEST:g} Pa, softer than any silicone; if it is in kPa, "
+        f"write {1e3 * youngs_modulus:g}"
+    )
+
+
 @dataclass(frozen=True)
 class Material:
     """A homogeneous, nearly incompressible rubber.
@@ -86,6 +99,9 @@ class Material:
             if getattr(self, key) not in known:
                 advice = "; register a law of your own first (rafl.register_law)" if key == "law" else ""
                 raise ValueError(f"expected {key} to be one of {', '.join(known)}, got {getattr(self, key)!r}{advice}")
+        for key in ("youngs_modulus", "poissons_ratio", "density", "mass_damping", "stiffness_damping", "viscosity"):
+            if not np.isfinite(getattr(self, key)):
+                raise ValueError(f"expected a finite {key}, got {getattr(self, key)}")
         if not (self.youngs_modulus > 0 and -1 < self.poissons_ratio < 0.5 and self.density > 0):
             raise ValueError(
                 "expected a Young's modulus and a density above 0 and a Poisson's ratio between -1 and 0.5, "
@@ -96,20 +112,20 @@ class Material:
                 "expected mass_damping, stiffness_damping and viscosity of at least 0, "
                 f"got {self.mass_damping}, {self.stiffness_damping}, {self.viscosity}"
             )
-
         if len(self.branch_shares) != len(self.branch_times):
             raise ValueError(
                 f"expected as many branch_shares as branch_times, got {len(self.branch_shares)} and "
                 f"{len(self.branch_times)}"
             )
-        if min(self.branch_shares, default=0.0) < 0 or min(self.branch_times, default=1.0) <= 0:
+        finite = np.isfinite(self.branch_shares).all() and np.isfinite(self.branch_times).all()
+        if not finite or min(self.branch_shares, default=0.0) < 0 or min(self.branch_times, default=1.0) <= 0:
             raise ValueError(
                 "expected branch_shares of at least 0 and branch_times above 0, "
                 f"got {self.branch_shares} and {self.branch_times}"
             )
         for key, units in (("energy_weights", ENERGY_UNITS), ("dissipation_weights", VISCOSITY_UNITS)):
             weights = getattr(self, key)
-            if len(weights) not in (0, units) or not min(weights, default=0.0) >= 0:
+            if len(weights) not in (0, units) or not all(0.0 <= weight < np.inf for weight in weights):
                 raise ValueError(f"expected {units} {key} of at least 0, or none, got {weights}")
 
     @property

@@ -1,15 +1,17 @@
 """Fit a model by any method: check the inputs, open the run folder, train."""
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from rafl.common.errors import InputError
+from rafl.common.files import new_folders
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.fitting.distributed import process_count, rank
 from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs
-from rafl.fitting.run_folder import FittedModel, Settings, read_settings, write_settings
+from rafl.fitting.run_folder import HISTORY_FILE, SETTINGS_FILE, FittedModel, Settings, read_settings, write_settings
 from rafl.fitting.train_field import Report, pretraining_unavailable
 from rafl.fitting.warm_start import MAX_VERTICES
 
@@ -93,10 +95,11 @@ def fit(
             f"torchrun: expected method rafl, the only one that trains on several processes, found {method}; run "
             "rafl-fit without torchrun"
         )
-    if rank() == 0:  # of the processes that torchrun started
-        open_run(Path(run), settings, resume)
-        _notify_unused_settings(loaded, settings, notify)
-    return METHODS[method](loaded, settings, Path(run), report or (lambda row: None))
+    with ExitStack() as stack:
+        if rank() == 0:  # of the processes that torchrun started
+            stack.enter_context(open_run(Path(run), settings, resume))
+            _notify_unused_settings(loaded, settings, notify)
+        return METHODS[method](loaded, settings, Path(run), report or (lambda row: None))
 
 
 def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify: Callable[[str], None]) -> None:
@@ -107,8 +110,11 @@ def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify:
         notify(f"no pre-training: it needs implicit-euler, 1 substep, no viscosity and at most {MAX_VERTICES} vertices")
 
 
-def open_run(run: Path, settings: Settings, resume: bool) -> None:
+@contextmanager
+def open_run(run: Path, settings: Settings, resume: bool) -> Iterator[None]:
     """Create a run folder, or reopen one to resume its run. Two runs never share a folder.
+
+    A new folder is removed if the run fails before it has saved anything to resume from.
 
     Raises:
         InputError: the folder already holds a run or, when resuming, a run with other settings.
@@ -119,7 +125,16 @@ def open_run(run: Path, settings: Settings, resume: bool) -> None:
             raise InputError(
                 f"expected the settings in {run}/config.yaml to resume, found others; use the same settings"
             )
+        yield
         return
-    if (run / "config.yaml").exists():
+    if (run / SETTINGS_FILE).exists():
         raise InputError(f"{run} already holds a run; choose another --out, or continue it with --resume")
-    write_settings(run, settings)
+    with new_folders(run):
+        write_settings(run, settings)
+        try:
+            yield
+        except BaseException:
+            if not any(run.glob("*.pt")):
+                for name in (SETTINGS_FILE, HISTORY_FILE):
+                    (run / name).unlink(missing_ok=True)
+            raise

@@ -1,5 +1,7 @@
 """The run folder: the fitted model, its settings, its history and the checkpoint to resume from."""
 
+import io
+import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -8,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pydantic
 import torch
 import yaml
 
 from rafl.common.errors import InputError
-from rafl.common.files import atomic_file, require_file, write_text
-from rafl.common.yaml_files import check_format, read_yaml_content
+from rafl.common.files import require_file, write_bytes, write_text
+from rafl.common.yaml_files import check_format, describe_validation, read_yaml_content
+from rafl.fem.material import Material
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.energy_limit import LimitedForce
 from rafl.residual.global_residual import GlobalResidual
@@ -23,6 +27,8 @@ from rafl.simulation.simulator import Simulator
 from rafl.simulation.time_integration import INTEGRATORS
 
 FORMAT = "rafl-run/1"
+SETTINGS_FILE, HISTORY_FILE = "config.yaml", "history.csv"
+MAX_EXPANSION = 3  # of a file of tensors when it is unpacked; torch does not pack them
 TIME_INTEGRATION_KEY = "stepping"  # in model.pt
 ENERGY_KEY, SEEN_KEY = "energy_fraction", "seen"
 
@@ -127,7 +133,7 @@ class Settings:
 def write_settings(run: Path, settings: Settings) -> None:
     """Write `config.yaml`."""
     content = {"format": FORMAT, **asdict(settings), "datasets": list(settings.datasets)}
-    write_text(run / "config.yaml", yaml.safe_dump(content, sort_keys=False))
+    write_text(run / SETTINGS_FILE, yaml.safe_dump(content, sort_keys=False))
 
 
 def read_settings(run: Path) -> Settings:
@@ -136,19 +142,22 @@ def read_settings(run: Path) -> Settings:
     Raises:
         InputError: not a run folder, or one of a newer version.
     """
-    path = run / "config.yaml"
+    path = run / SETTINGS_FILE
     content = read_yaml_content(path, "a run folder's settings (written by rafl-fit)", FORMAT)
     del content["format"]
     try:
-        return Settings(**{**content, "datasets": tuple(content["datasets"])})
-    except (TypeError, KeyError) as error:
-        raise InputError(f"expected settings written by rafl-fit in {path}: {error}; fit again") from None
+        return pydantic.TypeAdapter(Settings).validate_python(content)
+    except pydantic.ValidationError as error:
+        raise InputError(
+            f"expected settings written by rafl-fit in {path}: {describe_validation(error)}; fit again"
+        ) from None
 
 
 def save_tensors(path: Path, content: dict[str, object]) -> None:
-    """Save tensors and plain values atomically."""
-    with atomic_file(path) as temporary:
-        torch.save(content, temporary)
+    """Save tensors and plain values, completely or not at all."""
+    stream = io.BytesIO()
+    torch.save(content, stream)
+    write_bytes(path, stream.getbuffer())
 
 
 def load_tensors(path: Path, label: str) -> dict[str, Any]:
@@ -163,11 +172,15 @@ def load_tensors(path: Path, label: str) -> dict[str, Any]:
     """
     require_file(path, label)
     try:
+        with zipfile.ZipFile(path) as archive:
+            size = sum(item.file_size for item in archive.infolist())
+        if size > MAX_EXPANSION * path.stat().st_size:
+            raise ValueError(f"its parts would take {size / 1e6:.0f} MB")
         content = torch.load(path, weights_only=True)
     except Exception as error:  # torch raises many kinds here; all mean the same to the user
-        reason = str(error).splitlines()[0]
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"expected {label} in {path}, which cannot be read: {reason:.120}; fit again") from None
-    if not isinstance(content, dict) or "method" not in content:
+    if not isinstance(content, dict) or not isinstance(content.get("method"), str):
         raise InputError(f"expected {label} in {path}, found something else; fit again")
     check_format(str(content.get("format", "")), FORMAT, path)
     return content
@@ -218,9 +231,10 @@ def load_model(run: str | Path) -> FittedModel:
         raise InputError(f"expected identified values by name in {run / 'model.pt'}, found a list; fit again")
     integration = content.get(TIME_INTEGRATION_KEY)
     if integration is not None and not _is_time_integration(integration):
-        raise InputError(
-            f"expected an integrator and substeps in {run / 'model.pt'}, found {integration!r:.80}; fit again"
-        )
+        raise InputError(f"expected an integrator and substeps in {run / 'model.pt'}, found others; fit again")
+    with expect_content("a material", run / "model.pt"):
+        values: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in (material or {}).items()}
+        Material(**values)
     network = field = None
     with expect_content("weights of this version", run / "model.pt"):
         if "network" in content:
@@ -232,6 +246,10 @@ def load_model(run: str | Path) -> FittedModel:
         strain, rate = map(float, content.get(SEEN_KEY, (0.0, 0.0)))
         seen = (strain, rate) if SEEN_KEY in content else None
         fraction = float(content[ENERGY_KEY]) if ENERGY_KEY in content else None
+        weights = [tensor for part in (network, field) if part is not None for tensor in part.state_dict().values()]
+        numbers = [torch.tensor([strain, rate, fraction or 0.0]), *weights]
+        if not all(bool(tensor.isfinite().all()) for tensor in numbers):
+            raise ValueError("numbers that are not finite")
     return FittedModel(content["method"], field, material, network, integration, None, fraction, seen)
 
 
@@ -249,4 +267,4 @@ def has_stalled(errors: Sequence[float], patience: int) -> bool:
 
 def write_history(run: Path, rows: list[dict[str, float]]) -> None:
     """Write `history.csv`, one row per epoch."""
-    write_text(run / "history.csv", pd.DataFrame(rows).to_csv(index=False))
+    write_text(run / HISTORY_FILE, pd.DataFrame(rows).to_csv(index=False))

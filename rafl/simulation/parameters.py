@@ -1,5 +1,6 @@
 """Material parameters and gravity as tensors, so that a simulation can be differentiated with respect to them."""
 
+import math
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -9,6 +10,16 @@ from torch import Tensor
 from rafl.fem.laws import LAWS
 from rafl.fem.learned_energy import shared_weights
 from rafl.fem.material import Material, lame
+
+# Ranges of the parameters; the lower bound is left out for those in ABOVE_LOW.
+PHYSICAL_RANGES = {
+    **dict.fromkeys(("youngs_modulus", "density", "branch_times"), (0.0, math.inf)),
+    **dict.fromkeys(("mass_damping", "stiffness_damping", "viscosity", "branch_shares"), (0.0, math.inf)),
+    **dict.fromkeys(("energy_weights", "dissipation_weights"), (0.0, math.inf)),
+    "poissons_ratio": (-1.0, 0.5),
+    "gravity": (-math.inf, math.inf),
+}
+ABOVE_LOW = ("youngs_modulus", "density", "branch_times", "poissons_ratio", "gravity")
 
 
 @dataclass(frozen=True)
@@ -34,9 +45,16 @@ class Parameters:
 
     @classmethod
     def of(cls, material: Material, gravity: tuple[float, float, float], /, **replacements: Any) -> "Parameters":
-        """Parameters of a material under gravity [m/s^2], some of them replaced by name."""
+        """Parameters of a material under gravity [m/s^2], some of them replaced by name.
+
+        Raises:
+            ValueError: an unknown name, or a value outside its physical range.
+        """
         values = {item.name: getattr(material, item.name, gravity) for item in fields(cls)} | replacements
-        return cls(**{key: torch.as_tensor(value, dtype=torch.float64) for key, value in values.items()})
+        tensors = {key: torch.as_tensor(value, dtype=torch.float64) for key, value in values.items()}
+        for key in replacements:
+            _check_physical(key, tensors.get(key))
+        return cls(**tensors)
 
     @property
     def viscous(self) -> bool:
@@ -92,6 +110,18 @@ class Parameters:
         beta = self.stiffness_damping
         columns = (mu, lam, beta * rest_mu, beta * rest_lam)
         return torch.stack([column.expand(batch) for column in columns], dim=-1)
+
+
+def _check_physical(key: str, value: Tensor | None) -> None:
+    """Raise ValueError unless a parameter may have a value (of any shape)."""
+    if value is None or key not in {item.name for item in fields(Parameters)}:
+        raise ValueError(f"expected one of {', '.join(item.name for item in fields(Parameters))}, got {key!r}")
+    low, high = PHYSICAL_RANGES[key]
+    number = value.detach()
+    inside = (number > low if key in ABOVE_LOW else number >= low) & (number < high)
+    if not bool(inside.all()):
+        bound = "above" if key in ABOVE_LOW else "of at least"
+        raise ValueError(f"expected {key} {bound} {low:g} and below {high:g}, got {number[~inside].ravel()[0]:g}")
 
 
 def _acts(value: Tensor) -> bool:

@@ -70,8 +70,10 @@ class Simulator:
             raise ValueError(
                 f"expected fixed to hold node indices from 0 to {nodes - 1}, got {fixed.dtype} {fixed!r:.60}"
             )
-        if not (self.time_step > 0 and self.substeps >= 1):
+        if not (0 < self.time_step < np.inf and self.substeps >= 1):
             raise ValueError(f"expected time_step > 0 and substeps >= 1, got {self.time_step} and {self.substeps}")
+        if not np.isfinite(self.gravity).all():
+            raise ValueError(f"expected a finite gravity, got {self.gravity}")
 
     @property
     def time_integration(self) -> dict[str, Any]:

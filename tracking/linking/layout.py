@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, BaseModel, ConfigDict, Discriminator, Field, Tag
 
+from rafl.common.names import Name, check_distinct
 from rafl.common.yaml_files import StrictModel, read_yaml
 
 SPECIMEN_FORMAT = "rafl-specimen/1"
@@ -19,7 +20,7 @@ DEFAULT_SIGMA_MM = 0.5  # standard deviation of a dot that a hand places with a 
 class MarkerEntry(StrictModel):
     """One marker of a specimen."""
 
-    name: str = Field(min_length=1)
+    name: Name
     at_mm: tuple[float, float, float]
     at_sigma_mm: float = Field(default=DEFAULT_SIGMA_MM, ge=0)
 
@@ -43,7 +44,7 @@ class MarkerGrid(StrictModel):
     the ends columns follow y and rows go down. `spacing_mm` is that of columns and of rows, or one number for both.
     """
 
-    name: str = Field(min_length=1)
+    name: Name
     face: Literal["x-min", "x-max", "y-min", "y-max", "z-min", "z-max"]
     at_mm: tuple[float, float, float]
     rows: int = Field(ge=1, le=MAX_GRID_LINES)
@@ -63,10 +64,7 @@ class MarkerGrid(StrictModel):
 
 
 def _check_unique_names(markers: list[MarkerEntry | MarkerGrid]) -> list[MarkerEntry | MarkerGrid]:
-    names = [marker.name for item in markers for marker in item.markers()]
-    repeated = {name for name in names if names.count(name) > 1}
-    if repeated:
-        raise ValueError(f"expected different names, {sorted(repeated)[0]} occurs more than once")
+    check_distinct(marker.name for item in markers for marker in item.markers())
     return markers
 
 

@@ -2,16 +2,18 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import h5py
 import numpy as np
 import pandas as pd
+import pydantic
 from numpy.typing import NDArray
 
-from rafl.common.errors import InputError
-from rafl.common.files import atomic_file, require_file
+from rafl.common.arrays import ArrayFormat, read_arrays
+from rafl.common.hdf5_files import read_hdf5, write_hdf5
 from rafl.common.marker_table import marker_table
+from rafl.common.names import check_names, require_names
 from rafl.common.version import VERSION
 from rafl.common.yaml_files import check_format
 
@@ -19,7 +21,22 @@ Array = NDArray[Any]
 
 FORMAT = "rafl-tracks/1"
 STATES = ("missing", "measured", "filled")  # words for the values of `Tracks.state`
-PER_CAMERA_ARRAYS = ("pixel", "residual", "pixel_sigma", "damaged", "frame")
+LABEL = "tracks written by rafl-track"  # in messages about unreadable files
+# The arrays of a tracks file and of each camera in it. T: frames, M: markers.
+TRACKS_ARRAYS = {
+    "time": ArrayFormat(("T",)),
+    "position": ArrayFormat(("T", "M", 3), finite=False),
+    "sigma": ArrayFormat(("T", "M", 3), finite=False, low=0.0),
+    "state": ArrayFormat(("T", "M"), "integer", low=0, high=len(STATES) - 1),
+}
+CAMERA_ARRAYS = {
+    "pixel": ArrayFormat(("T", "M", 2), finite=False),
+    "residual": ArrayFormat(("T", "M"), finite=False),
+    "pixel_sigma": ArrayFormat(("T", "M", 2), finite=False, low=0.0),
+    "damaged": ArrayFormat(("T",), "truth"),
+    "frame": ArrayFormat(("T",), "integer", low=-1),
+}
+PICTURE = ArrayFormat(("bytes",), "integer", low=0, high=255)
 
 
 @dataclass(frozen=True)
@@ -44,6 +61,9 @@ class Tracks:
         settings: text of the settings used.
         notes: on contradictory video data, damaged frames and clock delays.
         version: of the program that tracked.
+
+    Raises:
+        InputError: the name of a marker or camera is invalid.
     """
 
     names: tuple[str, ...]
@@ -64,6 +84,10 @@ class Tracks:
     notes: tuple[str, ...] = ()
     version: str = VERSION
 
+    def __post_init__(self) -> None:
+        require_names(self.names, "markers of tracks")
+        require_names(self.pixel, "cameras of tracks")
+
     def table(self) -> pd.DataFrame:
         """One row per frame and marker: frame, time_s, marker, x_mm, ..., sigma_x_mm, ..., state (in words)."""
         table = marker_table(self.time, self.names, self.position)
@@ -78,10 +102,14 @@ class Tracks:
 
 
 def write_tracks(path: str | Path, tracks: Tracks) -> None:
-    """Write a tracks file, completely or not at all."""
+    """Write a tracks file, completely or not at all.
+
+    Raises:
+        InputError: the file cannot be written, or could not be read again.
+    """
     path = Path(path)
     sources = [f"{digest}  {name}" for name, digest in tracks.sources.items()]
-    with atomic_file(path) as temporary, h5py.File(temporary, "w") as file:
+    with write_hdf5(path, read_tracks) as file:
         file.attrs.update(
             {
                 "format": FORMAT,
@@ -95,10 +123,10 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
                 "sources": np.array(sources, h5py.string_dtype()),
             }
         )
-        for key in ("time", "position", "sigma", "state"):
+        for key in TRACKS_ARRAYS:
             file.create_dataset(key, data=getattr(tracks, key), fletcher32=True)
         for name in tracks.pixel:
-            for key in PER_CAMERA_ARRAYS:
+            for key in CAMERA_ARRAYS:
                 file.create_dataset(f"cameras/{name}/{key}", data=getattr(tracks, key)[name], fletcher32=True)
             for number, image in sorted(tracks.images[name].items()):
                 file[f"cameras/{name}/pictures/{number}"] = np.frombuffer(image, np.uint8)
@@ -111,38 +139,66 @@ def read_tracks(path: str | Path) -> Tracks:
         InputError: the file is missing, no tracks file, of a newer version, or damaged.
     """
     path = Path(path)
-    require_file(path, "a tracks file (.h5)")
-    try:
-        with h5py.File(path, "r") as file:
-            check_format(str(file.attrs.get("format", "")), FORMAT, path)
-            cameras = file.get("cameras", {})
-            lines = [str(line).split("  ", 1) for line in file.attrs["sources"]]
-            by_camera = {key: {name: group[key][()] for name, group in cameras.items()} for key in PER_CAMERA_ARRAYS}
-            images = {
-                name: {int(number): bytes(data[()]) for number, data in group.get("pictures", {}).items()}
-                for name, group in cameras.items()
-            }
-            return Tracks(
-                names=tuple(str(name) for name in file.attrs["marker_names"]),
-                time=file["time"][()],
-                position=file["position"][()],
-                sigma=file["sigma"][()],
-                state=file["state"][()],
-                pixel=by_camera["pixel"],
-                residual=by_camera["residual"],
-                pixel_sigma=by_camera["pixel_sigma"],
-                damaged=by_camera["damaged"],
-                frame=by_camera["frame"],
-                images=images,
-                fps=float(file.attrs["fps"]),
-                calibration=str(file.attrs["calibration"]),
-                sources={name: digest for digest, name in lines},
-                settings=str(file.attrs["settings"]),
-                notes=tuple(str(note) for note in file.attrs["notes"]),
-                version=str(file.attrs["software"]).removeprefix("rafl "),
-            )
-    except (OSError, KeyError, ValueError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"expected tracks written by rafl-track in {path}, which cannot be read: {reason}; track again"
-        ) from None
+    with read_hdf5(path, LABEL, "track again") as file:
+        check_format(str(file.attrs.get("format", "")), FORMAT, path)
+        return _read(file)
+
+
+class _FileAttributes(pydantic.BaseModel):
+    """Attributes of a tracks file."""
+
+    model_config = pydantic.ConfigDict(allow_inf_nan=False)
+
+    marker_names: tuple[str, ...] = pydantic.Field(min_length=1)
+    fps: float = pydantic.Field(gt=0)
+    calibration: str
+    settings: str
+    software: str
+    notes: tuple[str, ...]
+    sources: tuple[Annotated[str, pydantic.Field(pattern="^[0-9a-f]{64}  ")], ...]
+
+
+def _read(file: h5py.File) -> Tracks:
+    """The content of an open file.
+
+    Raises:
+        ValueError: a part differs from its description, or parts contradict one another.
+    """
+    about = _FileAttributes.model_validate(
+        {key: value.tolist() if hasattr(value, "tolist") else value for key, value in file.attrs.items()}
+    )
+    check_names(about.marker_names)
+    lengths = {"M": len(about.marker_names)}
+    arrays = read_arrays(file, TRACKS_ARRAYS, lengths)
+    time, measured = arrays["time"], arrays["state"] > 0
+    if len(time) < 1 or (np.diff(time) <= 0).any():
+        raise ValueError("time: expected one frame or more, each later than the one before")
+    if not np.isfinite(arrays["position"][measured]).all():
+        raise ValueError("position: expected finite numbers where the state is not missing")
+    cameras = file.get("cameras", {})
+    check_names(cameras)
+    by_camera = {
+        name: read_arrays(group, CAMERA_ARRAYS, lengths, f"cameras/{name}/") for name, group in cameras.items()
+    }
+    return Tracks(
+        names=about.marker_names,
+        time=time,
+        position=arrays["position"],
+        sigma=arrays["sigma"],
+        state=arrays["state"].astype(np.uint8),
+        **{key: {name: found[key] for name, found in by_camera.items()} for key in CAMERA_ARRAYS},
+        images={name: _read_images(group, f"cameras/{name}/pictures") for name, group in cameras.items()},
+        fps=about.fps,
+        calibration=about.calibration,
+        sources={name: digest for digest, name in (line.split("  ", 1) for line in about.sources)},
+        settings=about.settings,
+        notes=about.notes,
+        version=about.software.removeprefix("rafl "),
+    )
+
+
+def _read_images(camera: h5py.Group, label: str) -> dict[int, bytes]:
+    """The JPEG images of a camera by frame number."""
+    stored = camera.get("pictures", {})
+    arrays = {key: read_arrays(stored, {key: PICTURE}, {}, f"{label}/")[key] for key in stored}
+    return {int(number): image.astype(np.uint8).tobytes() for number, image in arrays.items()}

@@ -77,8 +77,13 @@ def natural_key(path: Path) -> list[tuple[int, str]]:
     return [(int(part), "") if part.isdecimal() else (0, part) for part in parts]
 
 
+def visible_entries(folder: Path) -> list[Path]:
+    """What is in a folder, in natural order, without hidden entries: macOS puts some beside the videos."""
+    return sorted((path for path in folder.iterdir() if not path.name.startswith(".")), key=natural_key)
+
+
 def _image_paths(folder: Path) -> list[Path]:
-    return sorted((path for path in folder.iterdir() if path.suffix.lower() in IMAGE_SUFFIXES), key=natural_key)
+    return [path for path in visible_entries(folder) if path.suffix.lower() in IMAGE_SUFFIXES]
 
 
 def is_video(path: Path) -> bool:

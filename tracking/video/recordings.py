@@ -4,10 +4,34 @@ from pathlib import Path
 
 from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
-from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, natural_key, open_video
+from rafl.common.names import require_names
+from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, open_video, visible_entries
 
 
 def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Video]]:
+    """The videos of each recording, opened, by camera.
+
+    Args:
+        videos: as for `find_videos`.
+        rig: as for `find_videos`.
+        calib: as for `find_videos`.
+
+    Raises:
+        InputError: as `find_videos` and `open_videos` say.
+    """
+    return {name: open_videos(paths, rig) for name, paths in find_videos(videos, rig, calib).items()}
+
+
+def open_videos(paths: dict[str, Path], rig: Rig) -> dict[str, Video]:
+    """Open the videos of one recording, by camera.
+
+    Raises:
+        InputError: one cannot be opened, or has another size than its camera.
+    """
+    return {camera: _open_checked(path, rig, camera) for camera, path in paths.items()}
+
+
+def find_videos(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Path]]:
     """Find the videos by recording and camera.
 
     Their names are `<recording>/<camera>.<ext>`, `<recording>_<camera>.<ext>`, or `<recording>.<ext>` if the rig has
@@ -39,17 +63,18 @@ def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, 
             )
         found[recording][camera] = path
 
-    for path in [videos] if is_video(videos) else sorted(videos.iterdir(), key=natural_key):
+    for path in [videos] if is_video(videos) else visible_entries(videos):
         if is_video(path):
             add(*_split_name(path, rig, calib), path)
         elif path.is_dir():
-            for part in sorted(path.iterdir(), key=natural_key):
+            for part in visible_entries(path):
                 if is_video(part):
                     name = part.name if part.is_dir() else part.stem
                     _check_camera(name, rig, calib, part)
                     add(path.name, name, part)
     if not found:
         raise InputError(f"expected videos in {videos}, found none; name them <recording>/<camera>.mp4")
+    require_names(found, f"recordings in {videos}")
     for recording, cameras in found.items():
         missing = set(rig.cameras) - set(cameras)
         if missing:
@@ -57,10 +82,7 @@ def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, 
                 f"recording {recording}: expected a video of every camera in {calib}, found none of "
                 f"{', '.join(sorted(missing))}; add it, or calibrate without that camera"
             )
-    return {
-        recording: {camera: _open_checked(path, rig, camera) for camera, path in cameras.items()}
-        for recording, cameras in found.items()
-    }
+    return found
 
 
 def _split_name(path: Path, rig: Rig, calib: Path) -> tuple[str, str]:

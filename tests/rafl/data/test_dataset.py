@@ -1,5 +1,6 @@
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -82,9 +83,88 @@ def test_law_of_ones_own(dataset: Dataset, tmp_path: Path) -> None:
 
 def test_empty_dataset_is_refused(dataset: Dataset, tmp_path: Path) -> None:
     path = tmp_path / "a.h5"
-    write_dataset(path, Dataset(dataset.name, dataset.simulator, dataset.markers, {}))
+    with pytest.raises(InputError, match=r"not written, .* at least one trajectory"):
+        write_dataset(path, Dataset(dataset.name, dataset.simulator, dataset.markers, {}))
+    write_dataset(path, dataset)
+    with h5py.File(path, "r+") as file:
+        del file["trajectories/a"], file["trajectories"]
     with pytest.raises(InputError, match="at least one trajectory"):
         read_dataset(path)
+
+
+def test_file_that_could_not_be_read_keeps_the_earlier_one(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    before = path.read_bytes()
+    for name in ("day1/load060g", "..", "", "a\nb", "x" * 200):
+        with pytest.raises(ValueError, match="recordings: expected a name"):
+            write_dataset(path, replace(dataset, trajectories={name: dataset.trajectories["a"]}))
+    with pytest.raises(InputError, match=r"not written, .* at least one trajectory"):
+        write_dataset(path, replace(dataset, trajectories={}))
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+DAMAGE: dict[str, tuple[str, Callable[[h5py.File], object]]] = {
+    "hexes as numbers with fractions": (
+        "mesh/hexes: expected elements of type integer, found float64",
+        lambda file: replace_array(file, "mesh/hexes", file["mesh/hexes"][()].astype(float)),
+    ),
+    "inverted cell": (
+        "cell [0-9]+ is inverted",
+        lambda file: file["mesh/hexes"].write_direct(file["mesh/hexes"][()][:, ::-1].copy()),
+    ),
+    "text for numbers": (
+        "markers/normal_offset: expected elements of type number",
+        lambda file: replace_array(file, "markers/normal_offset", np.array(["left"] * 20, dtype="S4")),
+    ),
+    "missing values": (
+        "markers/weights: expected finite numbers, found nan",
+        lambda file: replace_array(file, "markers/weights", np.full((20, 4), np.nan)),
+    ),
+    "nothing seen": (
+        "valid: expected a marker that is seen",
+        lambda file: replace_array(file, "trajectories/a/valid", np.zeros((25, 20), dtype=bool)),
+    ),
+    "short array": (
+        r"load: expected shape \(63, 3\), found \(62, 3\)",
+        lambda file: replace_array(file, "trajectories/a/load", np.zeros((62, 3))),
+    ),
+    "missing array": ("expected the array mesh/fixed, found none", lambda file: file.pop("mesh/fixed")),
+    "group for an array": ("expected an array, found a group", lambda file: make_group(file, "mesh/fixed")),
+    "array for a group": ("cannot be read", lambda file: replace_array(file, "material", np.zeros(3))),
+    "hostile name": (
+        "recordings: expected a name",
+        lambda file: file.move("trajectories/a", "trajectories/a\n"),
+    ),
+    "text for a number in an attribute": ("time_step: Input", lambda file: file.attrs.update({"time_step": "fast"})),
+    "infinite stiffness": ("finite", lambda file: file["material"].attrs.modify("youngs_modulus", np.inf)),
+    "damping that is no number": ("finite", lambda file: file["material"].attrs.modify("viscosity", np.nan)),
+    "unknown property": ("cannot be read", lambda file: file["material"].attrs.modify("colour", 1.0)),
+    "newer version": ("newer", lambda file: file.attrs.modify("format", "rafl-dataset/7")),
+}
+
+
+def replace_array(file: h5py.File, key: str, value: np.ndarray) -> None:
+    del file[key]
+    file[key] = value
+
+
+def make_group(file: h5py.File, key: str) -> None:
+    del file[key]
+    file.create_group(key)
+
+
+@pytest.mark.parametrize("name", DAMAGE)
+def test_damaged_part_is_named(dataset: Dataset, tmp_path: Path, name: str) -> None:
+    message, damage = DAMAGE[name]
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    with pytest.raises(InputError, match=message) as error:
+        read_dataset(path)
+    assert "\n" not in str(error.value)
 
 
 def content(path: Path, name: str) -> dict[str, bytes]:
