@@ -66,6 +66,15 @@ class Camera:
         """Derivative of `project_undistorted` with respect to the point [px/m], (..., 2, 3)."""
         raise NotImplementedError
 
+    def sight_equations(self, undistorted: Array) -> tuple[Array, Array]:
+        """Linear equations of the lines of sight of undistorted pixels (..., 2).
+
+        Returns:
+            A (..., 2, 3) and b (..., 2): the points X [m] with A X = b are those that `project_undistorted` maps to the
+            pixel.
+        """
+        raise NotImplementedError
+
     def distort(self, undistorted: Array) -> Array:
         """Distorted pixels (..., 2) of undistorted pixels (..., 2)."""
         raise NotImplementedError
@@ -117,6 +126,11 @@ class OrthographicCamera(Camera):
         """See `Camera`. It is the same for all points."""
         return np.broadcast_to(self.projection_matrix, (*points.shape[:-1], 2, 3))
 
+    def sight_equations(self, undistorted: Array) -> tuple[Array, Array]:
+        """See `Camera`."""
+        slopes = np.broadcast_to(self.projection_matrix, (*undistorted.shape[:-1], 2, 3))
+        return slopes, undistorted - np.asarray(self.offset)
+
     def distort(self, undistorted: Array) -> Array:
         """See `Camera`."""
         centre, half_diagonal = centre_and_half_diagonal(self.image_size)
@@ -125,48 +139,67 @@ class OrthographicCamera(Camera):
 
 @dataclass(frozen=True, kw_only=True)
 class PinholeCamera(Camera):
-    """OpenCV's pinhole model: u = f x / z + c, with distorted (x, y) / z.
+    """OpenCV's pinhole model with skew: [u, v] = K2 [x, y] / z + c with K2 = [[fx, skew], [0, fy]].
+
+    (x, y) / z is distorted before.
 
     Attributes:
         focal: focal lengths fx, fy [px].
         centre: principal point cx, cy [px].
         translation: position of the world origin in the camera frame [m], (3).
+        skew: [px].
         distortion: k1, k2, p1, p2, k3.
     """
 
     focal: tuple[float, float]
     centre: tuple[float, float]
     translation: tuple[float, float, float]
+    skew: float = 0.0
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    @cached_property
+    def _k2(self) -> Array:
+        return np.array([[self.focal[0], self.skew], [0.0, self.focal[1]]])
 
     def _to_camera_frame(self, points: Array) -> Array:
         result: Array = points @ self.rotation.T + np.asarray(self.translation)
         return result
 
+    def _to_pixels(self, normalised: Array) -> Array:
+        """Pixels of image coordinates (x, y) / z, (..., 2)."""
+        result: Array = normalised @ self._k2.T + np.asarray(self.centre)
+        return result
+
     def project_undistorted(self, points: Array) -> Array:
         """See `Camera`."""
         local = self._to_camera_frame(points)
-        result: Array = local[..., :2] / local[..., 2:] * np.asarray(self.focal) + np.asarray(self.centre)
-        return result
+        return self._to_pixels(local[..., :2] / local[..., 2:])
 
     def projection_jacobian(self, points: Array) -> Array:
         """See `Camera`."""
         local = self._to_camera_frame(points)
         depth = local[..., 2, None, None]
-        focal = np.asarray(self.focal)[:, None]
-        result: Array = focal / depth * (self.rotation[:2] - local[..., :2, None] / depth * self.rotation[2])
+        slopes = (self.rotation[:2] - local[..., :2, None] / depth * self.rotation[2]) / depth
+        result: Array = self._k2 @ slopes
         return result
+
+    def sight_equations(self, undistorted: Array) -> tuple[Array, Array]:
+        """See `Camera`: the projection multiplied by the depth z."""
+        offset = undistorted - np.asarray(self.centre)
+        translation = np.asarray(self.translation)
+        slopes = self._k2 @ self.rotation[:2] - offset[..., None] * self.rotation[2]
+        return slopes, offset * translation[2] - self._k2 @ translation[:2]
 
     def distort(self, undistorted: Array) -> Array:
         """See `Camera`."""
-        x, y = np.moveaxis((undistorted - np.asarray(self.centre)) / np.asarray(self.focal), -1, 0)
+        normalised = (undistorted - np.asarray(self.centre)) @ np.linalg.inv(self._k2).T
+        x, y = np.moveaxis(normalised, -1, 0)
         k1, k2, p1, p2, k3 = self.distortion
         r2 = x * x + y * y
         radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
         distorted_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
         distorted_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-        result: Array = np.stack([distorted_x, distorted_y], axis=-1) * np.asarray(self.focal) + np.asarray(self.centre)
-        return result
+        return self._to_pixels(np.stack([distorted_x, distorted_y], axis=-1))
 
 
 def centre_and_half_diagonal(image_size: tuple[int, int]) -> tuple[Array, float]:

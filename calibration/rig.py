@@ -98,6 +98,7 @@ class _PinholeEntry(_Entry):
     model: Literal["pinhole"]
     focal_px: PositivePair
     centre_px: tuple[float, float]
+    skew_px: float = 0.0
     translation_mm: tuple[float, float, float]
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
@@ -107,6 +108,7 @@ class _PinholeEntry(_Entry):
         return PinholeCamera(
             focal=self.focal_px,
             centre=self.centre_px,
+            skew=self.skew_px,
             translation=(1e-3 * x, 1e-3 * y, 1e-3 * z),
             distortion=self.distortion,
             **self.common_arguments(),
@@ -171,6 +173,7 @@ def _entry(camera: Camera) -> dict[str, object]:
             "image_size": list(camera.image_size),
             "focal_px": list(camera.focal),
             "centre_px": list(camera.centre),
+            "skew_px": camera.skew,
             "rotation_vector": list(camera.rotation_vector),
             "translation_mm": [float(1e3 * t) for t in camera.translation],
             "distortion": list(camera.distortion),

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from rafl.calibration.board import read_board
 from rafl.calibration.board_images import board_views, check_shared_world
-from rafl.calibration.rig import Rig, read_calibration, write_calibration
+from rafl.calibration.foreign.read import read_any_calibration
+from rafl.calibration.rig import Rig, write_calibration
 from rafl.calibration.solve import solve_rig
 from rafl.capture.dataset.build import CaptureSettings
 from rafl.capture.dataset.build import build_dataset as build
@@ -38,7 +39,7 @@ from rafl.simulation.simulator import Simulator
 from rafl.tracking.linking.layout import read_layout
 from rafl.tracking.pipeline import TrackingSettings, track_recording
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
-from rafl.tracking.video.recordings import find_recordings
+from rafl.tracking.video.recordings import filmed_cameras, find_recordings
 
 __all__ = [
     "CaptureSettings",
@@ -132,11 +133,29 @@ def calibrate(
     return solve_rig(views, sizes, description, dict(tilt_signs or {}), model).rig
 
 
+def read_calibration(
+    path: str | Path, unit: str | None = None, image_sizes: Mapping[str, tuple[int, int]] | None = None
+) -> Rig:
+    """Read `calib.yaml`, or a calibration of OpenCV, aniposelib, Caliscope, MATLAB or DLT coefficients.
+
+    Args:
+        path: file, or folder of files with one camera each.
+        unit: mm, cm or m: unit of the lengths in a file that does not state it.
+        image_sizes: width and height [px] by camera, in the order of the file; needed if the file does not tell them,
+            or has no names for its cameras.
+
+    Raises:
+        InputError: the file cannot be read, or something in it or missing from it must be decided by you.
+    """
+    return read_any_calibration(Path(path), unit, lambda _: image_sizes or {})
+
+
 def track(
     videos: str | Path,
     calibration: str | Path,
     specimen: str | Path | None = None,
     *,
+    calibration_unit: str | None = None,
     fps: float | None = None,
     fill: int = 5,
     sync: bool = False,
@@ -145,8 +164,9 @@ def track(
 
     Args:
         videos: folder of videos (`<recording>/<camera>.mp4`), or one video.
-        calibration: `calib.yaml`.
+        calibration: `calib.yaml`, or a calibration of another program, see `read_calibration`.
         specimen: specimen description that names the markers; None to name them by row and column.
+        calibration_unit: mm, cm or m: unit of the lengths in a calibration that does not state it.
         fps: true frames per second; None to trust the videos.
         fill: longest gap to fill [frames].
         sync: find the time offsets of the cameras from the motion.
@@ -157,7 +177,7 @@ def track(
     Raises:
         InputError: a file cannot be read, or a recording cannot be tracked.
     """
-    rig = read_calibration(Path(calibration))
+    rig = read_any_calibration(Path(calibration), calibration_unit, lambda count: filmed_cameras(Path(videos), count))
     settings = TrackingSettings(read_layout(Path(specimen)) if specimen else None, fps, fill, sync)
     recordings = find_recordings(Path(videos), rig, Path(calibration))
     return {name: track_recording(sources, rig, settings, lambda: None) for name, sources in recordings.items()}

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from rafl import cli
+from rafl.calibration.foreign.read import UNITS
 from rafl.capture import cli as capture_cli
 from rafl.capture.rendering.film import ENCODINGS
 from rafl.fitting.methods import METHODS
@@ -32,6 +33,7 @@ REFUSED = [
     ["rafl-calibrate", "absent", "--model", "fisheye"],
     ["rafl-track", "absent", "--calib", "absent.yaml"],
     ["rafl-track", "absent", "--calib", "absent.yaml", "--export", "xls"],
+    ["rafl-track", ".", "--calib", ".", "--calib-unit", "feet"],
     ["rafl-capture", "absent.yaml"],
     ["rafl-capture", "absent.yaml", "tracks", "--recordings", "absent.csv"],
     ["rafl-capture", "--verify", "absent.h5"],
@@ -71,4 +73,5 @@ def test_options_name_what_the_library_has() -> None:
     assert tuple(METHODS) == cli.METHODS
     assert tuple(INTEGRATORS) == cli.INTEGRATORS
     assert tuple(WRITERS) == tracking_cli.EXPORT_FORMATS
+    assert tuple(UNITS) == tracking_cli.LENGTH_UNITS
     assert {codec.value for codec in capture_cli.Codec} == set(ENCODINGS)

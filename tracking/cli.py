@@ -11,8 +11,14 @@ from rafl.common.files import require_file, require_folder
 
 CAMERA_MODELS = ("orthographic", "pinhole")
 EXPORT_FORMATS = ("csv", "c3d", "trc", "npy")
-CALIBRATION_LABEL = "a calibration (calib.yaml, written by rafl-calibrate)"
+LENGTH_UNITS = ("mm", "cm", "m")
+CALIBRATION_LABEL = "a calibration (calib.yaml, written by rafl-calibrate, or one of another program)"
 SPECIMEN_LABEL = "a specimen description (specimen.yaml)"
+
+CalibUnit = Annotated[
+    str | None,
+    typer.Option(help="Unit of the lengths in a calibration of another program that does not state it: mm, cm or m."),
+]
 
 calibrate_app = create_app("Calibrate cameras.")
 track_app = create_app("Track markers in videos.")
@@ -47,8 +53,9 @@ def calibrate(
         float, typer.Option(min=0.0, help="Depth of the specimen [mm], for the perspective warning.")
     ] = 30.0,
     check: Annotated[
-        Path | None, typer.Option(help="Check this calib.yaml against the images instead of calibrating.")
+        Path | None, typer.Option(help="Check this calibration against the images instead of calibrating.")
     ] = None,
+    calib_unit: CalibUnit = None,
 ) -> None:
     """Calibrate the cameras from images of a ChArUco board, a chessboard or a dot grid, or of a specimen at rest.
 
@@ -63,8 +70,8 @@ def calibrate(
     if (images is None) == (from_rest is None):
         raise InputError("expected a folder of board images, or --from-rest and a folder of videos; give one of them")
     if from_rest is not None:
-        if board or check or model != "orthographic":
-            raise InputError("--from-rest: expected neither --board, --check nor --model pinhole; leave them out")
+        if board or check or calib_unit or model != "orthographic":
+            raise InputError("--from-rest: expected no --board, --check, --calib-unit or --model pinhole; leave it out")
         if specimen is None:
             raise InputError("--from-rest: expected --specimen specimen.yaml, which gives the marker positions")
         require_folder(from_rest, "a folder with one video per camera")
@@ -79,20 +86,36 @@ def calibrate(
     require_folder(images, "a folder of board images")
     board = require_file(board or images / "board.yaml", "a board description (board.yaml)")
     if check is not None:
-        require_file(check, CALIBRATION_LABEL)
+        _check_calibration(check, calib_unit)
+    elif calib_unit:
+        raise InputError("expected --calib-unit with --check only; leave it out")
     from rafl.tracking import commands
 
     if check is not None:
-        commands.check_calibration(check, images, board)
+        commands.check_calibration(check, calib_unit, images, board)
     else:
         commands.calibrate(images, board, model, tilt_sign or [], 1e-3 * depth_mm, out)
+
+
+def _check_calibration(path: Path, unit: str | None) -> None:
+    """Refuse a calibration that is not there, and a unit that is none."""
+    if not path.is_dir():  # a folder holds one camera a file
+        require_file(path, CALIBRATION_LABEL)
+    if unit is not None and unit not in LENGTH_UNITS:
+        raise InputError(f"--calib-unit: expected {', '.join(LENGTH_UNITS)}, found {unit!r}")
 
 
 @track_app.command()
 @report_errors
 def track(
     videos: Annotated[Path, typer.Argument(help="Folder of videos (or of image folders), or one video.")],
-    calib: Annotated[Path, typer.Option(help="Calibration (calib.yaml).")],
+    calib: Annotated[
+        Path,
+        typer.Option(
+            help="Calibration: calib.yaml, or one of OpenCV, aniposelib, Caliscope, MATLAB or DLT coefficients."
+        ),
+    ],
+    calib_unit: CalibUnit = None,
     specimen: Annotated[
         Path | None, typer.Option(help="specimen.yaml, which names the markers [row and column].")
     ] = None,
@@ -120,9 +143,9 @@ def track(
             raise InputError(f"--export: expected some of {', '.join(EXPORT_FORMATS)}, found {kind!r}")
     if not videos.exists():
         raise InputError(f"expected videos at {videos}, found nothing there; check the path")
-    require_file(calib, CALIBRATION_LABEL)
+    _check_calibration(calib, calib_unit)
     if specimen is not None:
         require_file(specimen, SPECIMEN_LABEL)
     from rafl.tracking import commands
 
-    commands.track(videos, calib, specimen, out, fps, fill, sync, exports, overlay, jobs)
+    commands.track(videos, calib, calib_unit, specimen, out, fps, fill, sync, exports, overlay, jobs)

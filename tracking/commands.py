@@ -20,7 +20,8 @@ from threadpoolctl import threadpool_limits
 from rafl.calibration.board import read_board
 from rafl.calibration.board_images import board_views, check_shared_world
 from rafl.calibration.camera import Camera
-from rafl.calibration.rig import Rig, read_calibration, write_calibration
+from rafl.calibration.foreign.read import read_any_calibration
+from rafl.calibration.rig import Rig, write_calibration
 from rafl.calibration.solve import solve_rig
 from rafl.calibration.summary import camera_table, check_table, perspective_messages
 from rafl.calibration.validation import check_view, write_residual_plot
@@ -36,7 +37,7 @@ from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 from rafl.tracking.report import summary_cells, write_report
 from rafl.tracking.rest import FACES, open_rest_videos, solve_rest_camera
 from rafl.tracking.video.reader import Video
-from rafl.tracking.video.recordings import find_videos, open_videos
+from rafl.tracking.video.recordings import filmed_cameras, find_videos, open_videos
 
 # Time [s] between two checks for a signal while waiting for a recording: not every signal interrupts the wait.
 SIGNAL_CHECK_S = 1.0
@@ -123,14 +124,20 @@ def calibrate_from_rest(folder: Path, specimen: Path, face: list[str], tilt_sign
     _print_next(out)
 
 
-def check_calibration(calib: Path, images: Path, board: Path) -> None:
+def check_calibration(calib: Path, unit: str | None, images: Path, board: Path) -> None:
     """Print the residuals of a calibration on board images, and draw them into check-CAMERA.png.
+
+    Args:
+        calib: calibration.
+        unit: of the lengths in a calibration of another program that does not state it; None otherwise.
+        images: folder with one subfolder of board images per camera.
+        board: board description.
 
     Raises:
         InputError: a file cannot be read, or the images are not of the calibrated cameras.
     """
     views, sizes = board_views(images, read_board(board))
-    rig = read_calibration(calib)
+    rig = read_any_calibration(calib, unit, lambda _: sizes)
     checked = {}
     for name, own in views.items():
         if name not in rig.cameras:
@@ -181,6 +188,7 @@ def _tilt_signs(given: list[str], cameras: list[str]) -> dict[str, int]:
 def track(
     videos: Path,
     calib: Path,
+    unit: str | None,
     specimen: Path | None,
     out: Path,
     fps: float | None,
@@ -195,6 +203,7 @@ def track(
     Args:
         videos: folder of videos, or one video.
         calib: calibration.
+        unit: of the lengths in a calibration of another program that does not state it; None otherwise.
         specimen: specimen description that names the markers; None to name them by row and column.
         out: folder for the tracks.
         fps: true frames per second; None to trust the videos.
@@ -210,7 +219,7 @@ def track(
     """
     announce_compilation()
     require_writable(out)
-    rig = read_calibration(calib)
+    rig = read_any_calibration(calib, unit, partial(_announce_filmed, calib, videos))
     settings = TrackingSettings(read_layout(specimen) if specimen else None, fps, fill, sync)
     layout = settings.layout
     places = dict(zip(layout.names, layout.positions, strict=True)) if layout else {}
@@ -267,6 +276,15 @@ def _write_overlays(out: Path, name: str, videos: dict[str, Video], rig: Rig, tr
             write_overlay(path, video, camera, rig.cameras[camera], tracks, partial(bar.advance, task))
         finally:
             bar.remove_task(task)
+
+
+def _announce_filmed(calib: Path, videos: Path, count: int) -> dict[str, tuple[int, int]]:
+    """The filmed cameras and their image sizes, which the calibration does not tell."""
+    filmed = filmed_cameras(videos, count)
+    typer.echo(
+        f"camera names and image sizes that {calib} lacks are those of the videos: {', '.join(filmed)}, in order"
+    )
+    return filmed
 
 
 def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int) -> None:

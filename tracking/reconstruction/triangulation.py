@@ -135,21 +135,29 @@ class _Solution:
     def of(
         cls, rig: Rig, pixels: dict[str, CameraPixels], ideal: dict[str, Array], seen: dict[str, NDArray[np.bool_]]
     ) -> "_Solution":
-        """Solve for the positions from the cameras that see each marker, `seen` (T, M)."""
+        """Solve for the positions from the cameras that see each marker, `seen` (T, M).
+
+        The lines of sight give a linear estimate. For orthographic cameras it is the solution; for pinhole cameras,
+        Gauss-Newton on the reprojection residuals follows.
+        """
         count = _count(seen)
-        position = np.zeros((*count.shape, 3))
         known = count > 0
+        position = np.where(known[..., None], 0.0, np.full(3, np.nan))
         covariance = np.broadcast_to(np.eye(3), (*count.shape, 3, 3))
         linear = all(isinstance(rig.cameras[name], OrthographicCamera) for name in pixels)
-        for _ in range(1 if linear else MAX_ITERATIONS):
+        for iteration in range(1 if linear else MAX_ITERATIONS):
             normal = np.zeros((*count.shape, 3, 3))
             right = np.zeros((*count.shape, 3))
             for name, item in pixels.items():
                 camera = rig.cameras[name]
-                slopes = camera.projection_jacobian(position)
-                sigma = np.where(seen[name][..., None], item.sigma, 1.0)
-                weight = np.where(seen[name][..., None], 1.0 / sigma**2, 0.0)
-                gap = np.where(seen[name][..., None], ideal[name] - camera.project_undistorted(position), 0.0)
+                if iteration == 0:
+                    slopes, gap = camera.sight_equations(ideal[name])
+                else:
+                    slopes = camera.projection_jacobian(position)
+                    gap = ideal[name] - camera.project_undistorted(position)
+                slopes = np.where(seen[name][..., None, None], slopes, 0.0)
+                gap = np.where(seen[name][..., None], gap, 0.0)
+                weight = 1.0 / np.where(seen[name][..., None], item.sigma, 1.0) ** 2
                 normal += np.einsum("...k,...ki,...kj->...ij", weight, slopes, slopes)
                 right += np.einsum("...k,...ki,...k->...i", weight, slopes, gap)
                 alone = seen[name] & (count == 1)
@@ -166,7 +174,7 @@ class _Solution:
             if np.abs(step).max(initial=0.0) < 1e-12:
                 break
         sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-        return cls(np.where(known[..., None], position, np.nan), np.where(known[..., None], sigma, np.nan))
+        return cls(position, np.where(known[..., None], sigma, np.nan))
 
 
 def _excess(

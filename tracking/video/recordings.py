@@ -1,11 +1,12 @@
 """Find the videos of each recording."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
 from rafl.common.names import require_names
-from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, open_video, visible_entries
+from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, natural_key, open_video, visible_entries
 
 
 def find_recordings(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Video]]:
@@ -46,13 +47,7 @@ def find_videos(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Path
         InputError: no video is found, `videos` is not a video, a video's camera is not in the rig, a recording lacks a
             camera of the rig, or a video is unreadable or differs in size from its camera.
     """
-    if not videos.exists():
-        raise InputError(f"expected videos at {videos}, found nothing there; check the path")
-    if videos.is_file() and not is_video(videos):
-        raise InputError(
-            f"expected a folder of videos or a video ({', '.join(sorted(VIDEO_SUFFIXES))}) at {videos}, found "
-            "another file type; check the path"
-        )
+    _check_videos(videos)
     found: dict[str, dict[str, Path]] = {}
 
     def add(recording: str, camera: str, path: Path) -> None:
@@ -63,15 +58,12 @@ def find_videos(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Path
             )
         found[recording][camera] = path
 
-    for path in [videos] if is_video(videos) else visible_entries(videos):
-        if is_video(path):
+    for recording, path in _video_paths(videos):
+        if recording is None:
             add(*_split_name(path, rig, calib), path)
-        elif path.is_dir():
-            for part in visible_entries(path):
-                if is_video(part):
-                    name = part.name if part.is_dir() else part.stem
-                    _check_camera(name, rig, calib, part)
-                    add(path.name, name, part)
+        else:
+            _check_camera(_stem(path), rig, calib, path)
+            add(recording, _stem(path), path)
     if not found:
         raise InputError(f"expected videos in {videos}, found none; name them <recording>/<camera>.mp4")
     require_names(found, f"recordings in {videos}")
@@ -85,9 +77,65 @@ def find_videos(videos: Path, rig: Rig, calib: Path) -> dict[str, dict[str, Path
     return found
 
 
+def filmed_cameras(videos: Path, count: int) -> dict[str, tuple[int, int]]:
+    """Names of the cameras in the names of the videos, in order, and the image size [px] of each.
+
+    The size is that of the camera's first video that can be opened. If there is one camera, videos beside each other
+    need not name it; it is then called `camera`.
+
+    Args:
+        videos: folder, or a single video.
+        count: number of cameras that are expected.
+
+    Raises:
+        InputError: no video is found, or none of a camera can be opened.
+    """
+    _check_videos(videos)
+    paths: dict[str, list[Path]] = {}
+    for recording, path in _video_paths(videos):
+        name = _stem(path) if recording is not None else "camera" if count == 1 else _stem(path).rpartition("_")[2]
+        paths.setdefault(name, []).append(path)
+    return {name: _first_size(paths[name]) for name in sorted(paths, key=lambda name: natural_key(Path(name)))}
+
+
+def _first_size(paths: list[Path]) -> tuple[int, int]:
+    """Image size [px] of the first video that can be opened."""
+    for path in paths[:-1]:
+        try:
+            return open_video(path).size
+        except InputError:
+            continue
+    return open_video(paths[-1]).size
+
+
+def _check_videos(videos: Path) -> None:
+    """Refuse a path at which there are no videos."""
+    if not videos.exists():
+        raise InputError(f"expected videos at {videos}, found nothing there; check the path")
+    if videos.is_file() and not is_video(videos):
+        raise InputError(
+            f"expected a folder of videos or a video ({', '.join(sorted(VIDEO_SUFFIXES))}) at {videos}, found "
+            "another file type; check the path"
+        )
+
+
+def _video_paths(videos: Path) -> Iterator[tuple[str | None, Path]]:
+    """Recording, None for a video that lies in no recording's folder, and path of every video."""
+    for path in [videos] if is_video(videos) else visible_entries(videos):
+        if is_video(path):
+            yield None, path
+        elif path.is_dir():
+            yield from ((path.name, part) for part in visible_entries(path) if is_video(part))
+
+
+def _stem(path: Path) -> str:
+    """Name of a video, or of a folder of images, without ending."""
+    return path.resolve().name if path.is_dir() else path.stem
+
+
 def _split_name(path: Path, rig: Rig, calib: Path) -> tuple[str, str]:
     """Recording and camera in the name of a video."""
-    stem = path.resolve().name if path.is_dir() else path.stem
+    stem = _stem(path)
     for camera in rig.cameras:
         if stem.endswith(f"_{camera}"):
             return stem.removesuffix(f"_{camera}"), camera

@@ -1,10 +1,13 @@
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import stereo
 
 from rafl.calibration.camera import OrthographicCamera, PinholeCamera, Plane
-from rafl.calibration.rig import Rig
+from rafl.calibration.foreign.read import read_any_calibration
+from rafl.calibration.rig import Rig, write_calibration
 from rafl.common.errors import InputError
 from rafl.tracking.reconstruction.triangulation import CameraPixels, resample_pixels, triangulate
 
@@ -122,3 +125,29 @@ def test_pinhole_and_orthographic_cameras_together(random: np.random.Generator) 
     position, sigma, _ = triangulate(rig, {name: film(camera, points) for name, camera in rig.cameras.items()})
     np.testing.assert_allclose(position, points, atol=1e-8)
     assert (sigma < 2e-5).all()
+
+
+def test_calibrations_of_other_programs_give_the_same_points_as_calib_yaml(tmp_path: Path) -> None:
+    """The same pixels, through aniposelib's file, calib.yaml and MATLAB's, whose world is the left camera's frame."""
+    (tmp_path / "calibration.toml").write_text(stereo.aniposelib_text())
+    stereo.write_matlab_stereo(tmp_path / "stereo.mat")
+    rigs = {
+        "toml": read_any_calibration(tmp_path / "calibration.toml", "mm"),
+        "mat": read_any_calibration(
+            tmp_path / "stereo.mat", None, lambda _: dict.fromkeys(stereo.MATRICES, stereo.SIZE)
+        ),
+    }
+    write_calibration(tmp_path / "calib.yaml", rigs["toml"])
+    rigs["yaml"] = read_any_calibration(tmp_path / "calib.yaml")
+    pixels = {name: stereo.opencv_pixels(name)[None] for name in stereo.MATRICES}
+    pixels["left"][0, 5], pixels["right"][0, 5] = np.nan, np.nan  # seen by neither
+    pixels["right"][0, 7] = np.nan  # seen by one, which gives no depth
+    film = {name: CameraPixels(pixel, np.where(np.isfinite(pixel), 0.02, np.nan)) for name, pixel in pixels.items()}
+    found = {name: triangulate(rig, film)[0][0] for name, rig in rigs.items()}
+    points = 1e-3 * stereo.POINTS_MM
+    points[[5, 7]] = np.nan
+    np.testing.assert_allclose(found["toml"], points, atol=1e-9)
+    np.testing.assert_allclose(found["yaml"], points, atol=1e-9)
+    left = rigs["toml"].cameras["left"]
+    assert isinstance(left, PinholeCamera)
+    np.testing.assert_allclose(found["mat"], points @ left.rotation.T + left.translation, atol=1e-9)

@@ -1,10 +1,12 @@
 from pathlib import Path
 
+import pytest
 from support import write_video
 
 from rafl.calibration.camera import OrthographicCamera
 from rafl.calibration.rig import Rig
-from rafl.tracking.video.recordings import find_recordings
+from rafl.common.errors import InputError
+from rafl.tracking.video.recordings import filmed_cameras, find_recordings
 
 
 def camera() -> OrthographicCamera:
@@ -25,3 +27,16 @@ def test_recordings_are_found_by_name(tmp_path: Path) -> None:
     single = Rig({"front": camera()})
     write_video(tmp_path / "swing.mkv", "ffv1", "gray")
     assert set(find_recordings(tmp_path / "swing.mkv", single, Path("calib.yaml"))) == {"swing"}
+
+
+def test_filmed_cameras_are_in_order_with_the_size_of_a_readable_video(tmp_path: Path) -> None:
+    for name in ("a/cam10.mkv", "a/cam2.mkv", "b_cam2.mkv"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        write_video(tmp_path / name, "ffv1", "gray")
+    (tmp_path / "a/cam2.mkv").write_bytes(b"")
+    size = filmed_cameras(tmp_path, 2)["cam10"]
+    assert list(filmed_cameras(tmp_path, 2).items()) == [("cam2", size), ("cam10", size)]
+    assert filmed_cameras(tmp_path / "b_cam2.mkv", 1) == {"camera": size}
+    (tmp_path / "b_cam2.mkv").unlink()
+    with pytest.raises(InputError, match=r"cam2\.mkv"):
+        filmed_cameras(tmp_path, 2)
