@@ -46,7 +46,7 @@ def test_caliscope_cameras_take_the_filmed_names_in_the_order_of_their_numbers(t
         ("[-0.2, 0.7, -0.001, 0.0005, 0.0]", "[1, 2, 3, 4, 5, 6]", "k4 are not 0"),
         ('"right"', '"right"\nfisheye = true', "camera right: .* found a fisheye"),
         ('"right"', '"left"', "names that differ"),
-        ('"right"', '"../right"', "can be file names"),
+        ('"right"', '"../right"', "a name without slashes"),
         ('"right"', "7.5\n[", "found: "),
     ],
 )
