@@ -125,7 +125,7 @@ def specimen(
     ] = None,
     youngs_modulus: Annotated[
         float | None,
-        typer.Option(min=1.0, help="Young's modulus [Pa], if known better than about half [that of the material]."),
+        typer.Option(min=1.0, help="Young's modulus [Pa], if measured to about 10 % [assumed]."),
     ] = None,
     lying: Annotated[
         bool, typer.Option("--lying", help="The specimen lies flat, so that gravity does not bend it.")

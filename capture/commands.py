@@ -19,6 +19,7 @@ from rafl.capture.description.describe import Description, describe
 from rafl.capture.description.drawing import write_drawing
 from rafl.capture.description.specimen_text import body_like, body_of_box, body_of_surface, specimen_text
 from rafl.capture.description.stencil import design_stencil, write_stencil
+from rafl.capture.registration.places import MODULUS_SIGMA
 from rafl.capture.registration.registration import RestPose as RestPose
 from rafl.capture.rendering.film import ENCODINGS, render_video, side_cameras, write_board_images, write_truth
 from rafl.capture.rendering.motion import SimulatedMotion, tip_load_release, twist_release
@@ -34,7 +35,8 @@ from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, 
 from rafl.data.markers import Markers
 
 UNUSED_FPS = 100.0  # of a recording at rest without times
-MIN_SIGMA_MM = 0.01  # of a place in a specimen file, to which places are rounded
+MEASURED_SIGMA = 0.1  # standard deviation of log E that a user gives: tensile tests of soft rubber differ by so much
+UNCERTAIN_MM = 1.0  # a larger standard deviation of a place is worth a note [mm]: rulers are better
 DRAWN_MM = 2.0  # largest distance from the skin of the mesh at which a marker is drawn [mm]
 
 
@@ -119,7 +121,7 @@ class SpecimenBody:
     Attributes:
         size_mm, surface, like: of a box, a surface, or another specimen file; one of them is not None.
         element_mm: edge of the elements; None to choose it.
-        youngs_modulus: [Pa]; None for that of the material.
+        youngs_modulus: measured [Pa]; None for that of the material.
     """
 
     size_mm: tuple[float, float, float] | None
@@ -158,7 +160,8 @@ def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str |
     body = given.read(_specimen_name(out), out.parent)
     recording = read_recording(still, UNUSED_FPS, unit)
     try:
-        found = describe(recording, body, out.parent, lying, str(still))
+        sigma = MODULUS_SIGMA if given.youngs_modulus is None else MEASURED_SIGMA
+        found = describe(recording, body, out.parent, lying, str(still), sigma)
     except SimulationError as error:
         raise InputError(f"the body cannot bear its own weight: {error}; check its size and --youngs-modulus") from None
     places, sigmas = 1e3 * found.undeformed.carried.rest + 0.0, 1e3 * found.undeformed.sigma
@@ -166,7 +169,7 @@ def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str |
         {
             "name": found.names[k],
             "at_mm": [round(float(x), 2) for x in places[k]],
-            "at_sigma_mm": max(round(float(sigmas[k]), 2), MIN_SIGMA_MM),
+            "at_sigma_mm": round(float(sigmas[k]), 2),
         }
         for k in found.listed
     ]
@@ -184,15 +187,19 @@ def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str |
             "specimen, the size of the body is wrong",
             err=True,
         )
-    typer.echo(f"{len(markers)} dots; Young's modulus {_modulus_text(found)}")
+    typer.echo(f"{len(markers)} dots, places to {sigmas.max():.2f} mm; Young's modulus {_modulus_text(found)}")
+    if not lying and sigmas.max() > UNCERTAIN_MM:
+        typer.echo(
+            "note: the dots do not tell well how far the specimen sags; lay it flat (--lying), or measure its Young's "
+            "modulus (--youngs-modulus)"
+        )
     typer.echo(f"wrote {out} and {out.with_suffix('.png')}")
     typer.echo(f"next: rafl-track videos/ --calib calib.yaml --specimen {out}")
 
 
 def _modulus_text(found: Description) -> str:
     modulus, sigma = 1e-3 * found.youngs_modulus, 100.0 * found.undeformed.modulus_sigma
-    source = "that makes rows of dots straight and puts dots on their faces" if found.undeformed.straight else "assumed"
-    return f"{modulus:.3g} kPa +- {sigma:.0f} % ({source})"
+    return f"{modulus:.3g} kPa +- {sigma:.0f} %, {'from the sag' if found.sag_tells else 'assumed'}"
 
 
 def stencil(size_mm: tuple[float, float, float], dot_mm: float, out: Path) -> None:

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rafl.capture.description.alignment import align_with_surface
+from rafl.capture.description.alignment import Alignment, align_with_surface, find_pose
 from rafl.capture.description.naming import dots_by_row, faces_of, name_dots
 from rafl.capture.description.still import Dots, dots_at_rest
-from rafl.capture.description.undeformed import Shape, Undeformed, carry_back, find_undeformed
+from rafl.capture.description.undeformed import PLACED_SIGMA, Shape, Undeformed, carry_back, find_undeformed
 from rafl.capture.registration.places import MODULUS_SIGMA
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.rigid import MARKERS_PER_OUTLIER, MIN_MARKERS
@@ -22,6 +22,9 @@ from rafl.tracking.linking.naming import is_row_name
 
 Array = NDArray[Any]
 
+MAX_POSE_SIGMA = 1e-3  # largest standard deviation of a dot's place that an unknown frame may leave [m]
+UNKNOWN_POSE_SIGMA = 1e-2  # of the height and tilt of a body whose frame is found with E in turn [m]
+POSE_ITERATIONS = 3  # of the frame and E in turn
 MAX_DISTANCE = 3e-3  # of a dot from every face [m]: half a millimetre of the hand, and a body cast not quite to size
 
 
@@ -37,6 +40,7 @@ class Description:
         undeformed: their places, and the body as recorded.
         youngs_modulus: [Pa].
         left_out: dots that lie on no face, by their names in the file, and their distances from the nearest [m].
+        prior_sigma: standard deviation of log E of the assumed material.
     """
 
     shape: Shape
@@ -46,6 +50,12 @@ class Description:
     undeformed: Undeformed
     youngs_modulus: float
     left_out: dict[str, float]
+    prior_sigma: float
+
+    @property
+    def sag_tells(self) -> bool:
+        """Whether E follows from the sag rather than from the assumed material."""
+        return self.undeformed.modulus_sigma < 0.5 * self.prior_sigma
 
     @property
     def faces(self) -> list[str]:
@@ -53,15 +63,18 @@ class Description:
         return faces_of(self.undeformed.carried.normal)
 
 
-def describe(recording: Recording, body: Body, folder: Path, lying: bool, label: str) -> Description:
+def describe(
+    recording: Recording, body: Body, folder: Path, lying: bool, label: str, modulus_sigma: float = MODULUS_SIGMA
+) -> Description:
     """Find the dots of a specimen at rest, and their places on its undeformed body.
 
     Args:
-        recording: of the specimen at rest, in the specimen frame.
+        recording: of the specimen at rest; in another frame than the specimen's, the dots must tell where the body is.
         body: shape, assumed material and clamp.
         folder: that the file of a surface is relative to.
         lying: whether the specimen lies flat, so that gravity does not bend it; else it hangs on its clamp.
         label: of the recording, for messages.
+        modulus_sigma: standard deviation of log E of the assumed material.
 
     Raises:
         InputError: the specimen never rests, or its dots are not on the body.
@@ -77,13 +90,25 @@ def describe(recording: Recording, body: Body, folder: Path, lying: bool, label:
     dots = dots.select(np.array([name not in specimen.clamp_layout.names for name in dots.names]))
     left_out: dict[str, float] = {}
     q = simulator.equilibrium(simulator.weight[None], label=f"{label}: the specimen under its own weight")[0]
-    carried = carry_back(shape, q, dots)
-    sag = np.linalg.norm(dots.position - carried.gap - carried.rest, axis=1)
-    dots = _dots_on_body(shape, q, dots, carried.distance - MODULUS_SIGMA * sag, left_out, label)
-    undeformed = find_undeformed(shape, simulator, dots)
+    excess = _excess(shape, q, dots, modulus_sigma)
+    placed = recording.in_specimen_frame or float(np.median(excess)) < MAX_DISTANCE
+    if not placed:
+        alignment = find_pose(shape, q, dots)
+        dots = replace(dots, position=alignment.pose.apply(dots.position))
+        excess = _excess(shape, q, dots, modulus_sigma)
+        if float(np.median(excess)) < MAX_DISTANCE:
+            _check_pose(alignment, faces_of(carry_back(shape, q, dots).normal), label)
+    dots = _dots_on_body(shape, q, dots, excess, left_out, label)
+    undeformed = find_undeformed(shape, simulator, dots, modulus_sigma, PLACED_SIGMA if placed else UNKNOWN_POSE_SIGMA)
+    if not placed:
+        for _ in range(POSE_ITERATIONS):
+            alignment = align_with_surface(shape, undeformed.q, dots)
+            dots = replace(dots, position=alignment.pose.apply(dots.position))
+            undeformed = find_undeformed(shape, simulator, dots, modulus_sigma, UNKNOWN_POSE_SIGMA)
+        undeformed = replace(undeformed, sigma=np.hypot(undeformed.sigma, alignment.sigma))
     kept = _dots_on_body(shape, undeformed.q, dots, undeformed.carried.distance, left_out, label)
     if len(kept.names) < len(dots.names):
-        dots, undeformed = kept, find_undeformed(shape, simulator, kept)
+        dots, undeformed = kept, find_undeformed(shape, simulator, kept, modulus_sigma)
     faces, rest = faces_of(undeformed.carried.normal), undeformed.carried.rest
     names, listed = dots.names, np.arange(len(dots.names))
     if recording.names is None:  # a reader of such files takes the markers in the order of the specimen's
@@ -91,7 +116,24 @@ def describe(recording: Recording, body: Body, folder: Path, lying: bool, label:
     elif all(is_row_name(name) for name in names):
         names, listed = name_dots(faces, rest), np.concatenate(dots_by_row(faces, rest))
     modulus = specimen.material.youngs_modulus * float(np.exp(undeformed.log_modulus))
-    return Description(shape, dots, names, listed, undeformed, modulus, left_out)
+    return Description(shape, dots, names, listed, undeformed, modulus, left_out, modulus_sigma)
+
+
+def _excess(shape: Shape, q: Array, dots: Dots, modulus_sigma: float) -> Array:
+    """Distances of dots from the body beyond what its sag may be off, by the uncertain E [m], (M)."""
+    carried = carry_back(shape, q, dots)
+    sag = np.linalg.norm(dots.position - carried.gap - carried.rest, axis=1)
+    return np.asarray(carried.distance - modulus_sigma * sag)
+
+
+def _check_pose(alignment: Alignment, faces: list[str], label: str) -> None:
+    """Raise InputError if the dots do not tell where the body is."""
+    if alignment.sigma.max() > MAX_POSE_SIGMA:
+        raise InputError(
+            f"{label}: expected a recording in the specimen's frame, or dots that tell where the body is, found "
+            f"another frame and dots on {', '.join(sorted(set(faces)))} only; put dots on the tip and the "
+            "top too, or set the origin of the motion capture at the lower corner of the clamped face (x from clamp to tip, y across, z up)"
+        )
 
 
 def _dots_on_body(shape: Shape, q: Array, dots: Dots, distance: Array, left_out: dict[str, float], label: str) -> Dots:
@@ -115,7 +157,7 @@ def _dots_on_body(shape: Shape, q: Array, dots: Dots, distance: Array, left_out:
 
 def _reason(shape: Shape, q: Array, dots: Dots) -> str:
     """Whether another place or another size of the body would put the dots on its faces, and what to do."""
-    pose = align_with_surface(shape, q, dots)
+    pose = align_with_surface(shape, q, dots).pose
     moved = pose.apply(dots.position)
     distance = carry_back(shape, q, replace(dots, position=moved)).distance
     if np.mean(distance > MAX_DISTANCE) <= 1.0 / MARKERS_PER_OUTLIER:

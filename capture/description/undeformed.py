@@ -24,9 +24,12 @@ from rafl.tracking.linking.layout import DEFAULT_SIGMA_MM, GRID_DIRECTIONS
 
 Array = NDArray[Any]
 
-PLACED_SIGMA = 1e-3 * DEFAULT_SIGMA_MM  # of a dot from the straight row that a hand meant; of a body in its world [m]
+PLACED_SIGMA = (
+    1e-3 * DEFAULT_SIGMA_MM
+)  # of a dot from the straight row that a hand meant, and of a body in its world [m]
 ROW_OFFSET_SIGMA = 0.1  # of the height of a row, which nobody knows beforehand [m]
 MAX_ROW_SCATTER = 3.0  # dots farther from straight rows than this multiple of PLACED_SIGMA were not placed in rows
+MIN_SIGMA = 5e-5  # of a place, for what the model does not know of the clamp and of Poisson's ratio [m]
 MODULUS_STEP = 0.05  # of log E, for differences
 MODULUS_TOLERANCE = 1e-3  # the search ends with a smaller change of log E
 
@@ -71,11 +74,14 @@ def carry_back(shape: Shape, q: Array, dots: Dots) -> Carried:
         q: its nodes as it is deformed [m], (N, 3).
         dots: as recorded.
     """
-    mesh, found = shape.mesh, []
+    mesh, count = shape.mesh, len(dots.names)
     model_sigma = _model_sigma(np.linalg.norm(q - mesh.vertices, axis=1).max())
-    for position, sigma in zip(dots.position, np.hypot(dots.sigma, model_sigma), strict=True):
-        found.append(embed(HexMesh(q / sigma, mesh.hexes), ("",), (position / sigma)[None]))
-    quad, weights = (np.concatenate([getattr(item, key) for item in found]) for key in ("quad", "weights"))
+    sigma = np.exp(np.round(np.log(np.hypot(dots.sigma, model_sigma)), 1))  # dots of similar ones are embedded together
+    quad, weights = np.zeros((count, 4), dtype=np.int64), np.zeros((count, 4))
+    for unit in np.unique(sigma, axis=0):
+        own = np.flatnonzero((sigma == unit).all(axis=1))
+        found = embed(HexMesh(q / unit, mesh.hexes), ("",) * len(own), dots.position[own] / unit)
+        quad[own], weights[own] = found.quad, found.weights
     markers = Markers(dots.names, dots.position, quad, weights, np.zeros(len(quad)))
     deformed, undeformed = torch.from_numpy(q), torch.from_numpy(mesh.vertices)
     axes, rest_axes = markers.axes(deformed).numpy(), markers.axes(undeformed).numpy()
@@ -105,7 +111,6 @@ class Undeformed:
         q: the body as recorded [m], (N, 3).
         log_modulus: of E with which it sags so, relative to that of the assumed material.
         modulus_sigma: standard deviation of `log_modulus`.
-        straight: whether the dots lie in straight rows, which tell E.
     """
 
     carried: Carried
@@ -113,10 +118,15 @@ class Undeformed:
     q: Array
     log_modulus: float
     modulus_sigma: float
-    straight: bool
 
 
-def find_undeformed(shape: Shape, simulator: Simulator, dots: Dots) -> Undeformed:
+def find_undeformed(
+    shape: Shape,
+    simulator: Simulator,
+    dots: Dots,
+    prior_sigma: float = MODULUS_SIGMA,
+    world_sigma: float = PLACED_SIGMA,
+) -> Undeformed:
     """Find the places of dots together with Young's modulus, which is known roughly only.
 
     With a wrong E the dots of a straight row would not have been in line before the body sagged, and dots would not lie
@@ -124,18 +134,22 @@ def find_undeformed(shape: Shape, simulator: Simulator, dots: Dots) -> Undeforme
 
     - a dot's position across its row, which is off the row's by PLACED_SIGMA;
     - a dot's distance from its face, which is off zero by its sigma;
-    - both also by a height and a tilt of the body in its world, each of PLACED_SIGMA at the tip;
-    - log E, which is off that of the assumed material by MODULUS_SIGMA.
+    - both also by a height and a tilt of the body in its world, each of `world_sigma` at the tip;
+    - log E, which is off that of the assumed material by `prior_sigma`.
+
+    Dots that are far from straight rows at every E were not placed in rows, which then tell nothing.
 
     Args:
         shape: of the undeformed body.
         simulator: of the body with the assumed material.
         dots: as recorded, at rest under gravity. Without gravity the body is undeformed, and E stays as assumed.
+        prior_sigma: standard deviation of log E of the assumed material.
+        world_sigma: standard deviation of the body's place in the frame of the dots [m].
 
     Raises:
         SimulationError: an equilibrium could not be found.
     """
-    search = _ModulusSearch(shape, simulator, dots)
+    search = _ModulusSearch(shape, simulator, dots, prior_sigma, world_sigma)
     log_modulus, sigma, straight = search.minimise(with_rows=True)
     if not straight:
         log_modulus, sigma, _ = search.minimise(with_rows=False)
@@ -144,8 +158,8 @@ def find_undeformed(shape: Shape, simulator: Simulator, dots: Dots) -> Undeforme
     in_plane = [np.array(GRID_DIRECTIONS[face[0]]) for face in faces_of(carried.normal)]
     measured = np.linalg.norm(np.array(in_plane) * dots.sigma[:, None], axis=2).max(axis=1)
     model = _model_sigma(np.linalg.norm(dots.position - carried.rest, axis=1))
-    place_sigma = np.sqrt(measured**2 + model**2 + (sigma * np.linalg.norm(slope, axis=1)) ** 2)
-    return Undeformed(carried, place_sigma, q, log_modulus, sigma, straight)
+    place_sigma = np.sqrt(MIN_SIGMA**2 + measured**2 + model**2 + (sigma * np.linalg.norm(slope, axis=1)) ** 2)
+    return Undeformed(carried, place_sigma, q, log_modulus, sigma)
 
 
 @dataclass(frozen=True)
@@ -153,6 +167,8 @@ class _ModulusSearch:
     shape: Shape
     simulator: Simulator
     dots: Dots
+    prior_sigma: float
+    world_sigma: float
 
     def at(self, log_modulus: float) -> tuple[Array, Carried]:
         """The deformed body and the dots carried back from it, with log E relative to the assumed material's."""
@@ -164,7 +180,7 @@ class _ModulusSearch:
 
     def minimise(self, with_rows: bool) -> tuple[float, float, bool]:
         """Log E, its standard deviation, and whether the dots lie in straight rows."""
-        log_modulus, precision, straight = 0.0, MODULUS_SIGMA**-2.0, with_rows
+        log_modulus, precision, straight = 0.0, self.prior_sigma**-2.0, with_rows
         for _ in range(MAX_ITERATIONS):
             q, carried = self.at(log_modulus)
             later = self.at(log_modulus + MODULUS_STEP)[1]
@@ -173,8 +189,8 @@ class _ModulusSearch:
             residual, covariance = self._observations(carried, carried, faces, rows, q)
             slope = (self._observations(later, carried, faces, rows, q)[0] - residual) / MODULUS_STEP
             weighted = np.linalg.solve(covariance, np.column_stack([residual, slope]))
-            precision = float(slope @ weighted[:, 1]) + MODULUS_SIGMA**-2.0
-            step = -(float(slope @ weighted[:, 0]) + log_modulus * MODULUS_SIGMA**-2.0) / precision
+            precision = float(slope @ weighted[:, 1]) + self.prior_sigma**-2.0
+            step = -(float(slope @ weighted[:, 0]) + log_modulus * self.prior_sigma**-2.0) / precision
             across = slice(0, sum(map(len, rows)))
             own = residual[across] @ np.linalg.solve(covariance[across, across], residual[across])
             straight = with_rows and bool(own < MAX_ROW_SCATTER**2 * max(across.stop - len(rows), 1))
@@ -199,6 +215,6 @@ class _ModulusSearch:
         variance = np.concatenate([np.hypot(PLACED_SIGMA, self.dots.sigma[order].min(axis=1)), off_face]) ** 2
         height = np.concatenate([across @ up, base.direction @ up])
         tilt = height * np.concatenate([reach[order], reach]) / reach.max()
-        covariance = np.diag(variance) + PLACED_SIGMA**2 * (np.outer(height, height) + np.outer(tilt, tilt))
+        covariance = np.diag(variance) + self.world_sigma**2 * (np.outer(height, height) + np.outer(tilt, tilt))
         covariance[: len(order), : len(order)] += ROW_OFFSET_SIGMA**2 * (number[:, None] == number)
         return np.concatenate([position, carried.offset]), covariance

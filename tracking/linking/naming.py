@@ -188,6 +188,8 @@ def rows_and_columns(dots: Array) -> NDArray[np.int64]:
 
     Dots that form no grid, which may be bent, are ordered by the second coordinate, then by the first.
     """
+    if len(dots) == 1:
+        return np.zeros((1, 2), dtype=np.int64)
     indices = _grid_indices(dots)
     if indices is None:
         spacing = float(np.median(cKDTree(dots).query(dots, 2)[0][:, 1]))
