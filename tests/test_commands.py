@@ -25,7 +25,7 @@ from rafl.fitting.run_folder import FittedModel, save_model
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.global_residual import GlobalResidual
 
-COMMANDS = ("rafl-render", "rafl-calibrate", "rafl-track", "rafl-capture", "rafl-fit", "rafl-eval")
+COMMANDS = ("rafl-render", "rafl-calibrate", "rafl-track", "rafl-specimen", "rafl-capture", "rafl-fit", "rafl-eval")
 
 
 def folder_content(folder: Path) -> set[str]:
