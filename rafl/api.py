@@ -37,6 +37,7 @@ from rafl.simulation.parameters import Parameters
 from rafl.simulation.rollout import ResidualForce, Start, equilibrium, rollout
 from rafl.simulation.simulator import Simulator
 from rafl.tracking.linking.layout import read_layout
+from rafl.tracking.linking.naming import with_face_planes
 from rafl.tracking.pipeline import TrackingSettings, track_recording
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
 from rafl.tracking.video.recordings import filmed_cameras, find_recordings
@@ -178,7 +179,9 @@ def track(
         InputError: a file cannot be read, or a recording cannot be tracked.
     """
     rig = read_any_calibration(Path(calibration), calibration_unit, lambda count: filmed_cameras(Path(videos), count))
-    settings = TrackingSettings(read_layout(Path(specimen)) if specimen else None, fps, fill, sync)
+    layout = read_layout(Path(specimen)) if specimen else None
+    rig = with_face_planes(rig, layout) if layout else rig
+    settings = TrackingSettings(layout, fps, fill, sync)
     recordings = find_recordings(Path(videos), rig, Path(calibration))
     return {name: track_recording(sources, rig, settings, lambda: None) for name, sources in recordings.items()}
 

@@ -55,6 +55,10 @@ def calibrate(
     check: Annotated[
         Path | None, typer.Option(help="Check this calibration against the images instead of calibrating.")
     ] = None,
+    calib: Annotated[
+        Path | None,
+        typer.Option(help="With --from-rest: place this calibration on the specimen, instead of calibrating."),
+    ] = None,
     calib_unit: CalibUnit = None,
 ) -> None:
     """Calibrate the cameras from images of a ChArUco board, a chessboard or a dot grid, or of a specimen at rest.
@@ -63,6 +67,8 @@ def calibrate(
 
     Example without a board: rafl-calibrate --from-rest rest/ --specimen specimen.yaml --face left=y-min
 
+    With --calib CALIB as well, a calibration of another program is placed in the specimen frame.
+
     With --check CALIB, nothing is calibrated. The command tests CALIB on images that it was not made from.
     """
     if model not in CAMERA_MODELS:
@@ -70,25 +76,34 @@ def calibrate(
     if (images is None) == (from_rest is None):
         raise InputError("expected a folder of board images, or --from-rest and a folder of videos; give one of them")
     if from_rest is not None:
-        if board or check or calib_unit or model != "orthographic":
-            raise InputError("--from-rest: expected no --board, --check, --calib-unit or --model pinhole; leave it out")
+        if board or check or model != "orthographic":
+            raise InputError("--from-rest: expected neither --board, --check nor --model pinhole; leave them out")
         if specimen is None:
             raise InputError("--from-rest: expected --specimen specimen.yaml, which gives the marker positions")
         require_folder(from_rest, "a folder with one video per camera")
         require_file(specimen, SPECIMEN_LABEL)
+        if calib is not None:
+            if tilt_sign:
+                raise InputError("--calib: expected no --tilt-sign, which perspective tells; leave it out")
+            _check_calibration(calib, calib_unit)
+        elif calib_unit:
+            raise InputError("expected --calib-unit with --calib or --check only; leave it out")
         from rafl.tracking import commands
 
-        commands.calibrate_from_rest(from_rest, specimen, face or [], tilt_sign or [], out)
+        if calib is not None:
+            commands.place_calibration(calib, calib_unit, from_rest, specimen, face or [], out)
+        else:
+            commands.calibrate_from_rest(from_rest, specimen, face or [], tilt_sign or [], out)
         return
     assert images is not None
-    if specimen or face:
-        raise InputError("expected --specimen and --face with --from-rest only; leave them out")
+    if specimen or face or calib:
+        raise InputError("expected --specimen, --face and --calib with --from-rest only; leave them out")
     require_folder(images, "a folder of board images")
     board = require_file(board or images / "board.yaml", "a board description (board.yaml)")
     if check is not None:
         _check_calibration(check, calib_unit)
     elif calib_unit:
-        raise InputError("expected --calib-unit with --check only; leave it out")
+        raise InputError("expected --calib-unit with --calib or --check only; leave it out")
     from rafl.tracking import commands
 
     if check is not None:

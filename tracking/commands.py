@@ -20,7 +20,9 @@ from threadpoolctl import threadpool_limits
 from rafl.calibration.board import read_board
 from rafl.calibration.board_images import board_views, check_shared_world
 from rafl.calibration.camera import Camera
+from rafl.calibration.foreign.placement import KnownPoints, place_rig
 from rafl.calibration.foreign.read import read_any_calibration
+from rafl.calibration.rest_pose import camera_from_points
 from rafl.calibration.rig import Rig, write_calibration
 from rafl.calibration.solve import solve_rig
 from rafl.calibration.summary import camera_table, check_table, perspective_messages
@@ -30,12 +32,13 @@ from rafl.common.errors import InputError
 from rafl.common.files import require_writable
 from rafl.common.kernels import announce_compilation
 from rafl.tracking.linking.layout import read_layout
+from rafl.tracking.linking.naming import with_face_planes
 from rafl.tracking.overlay import write_overlay
 from rafl.tracking.pipeline import TrackingSettings, existing_tracks, track_recording
 from rafl.tracking.reconstruction.export import WRITERS, export_name
 from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 from rafl.tracking.report import summary_cells, write_report
-from rafl.tracking.rest import FACES, open_rest_videos, solve_rest_camera
+from rafl.tracking.rest import FACES, RestView, match_rest_video, open_rest_videos
 from rafl.tracking.video.reader import Video
 from rafl.tracking.video.recordings import filmed_cameras, find_videos, open_videos
 
@@ -93,35 +96,68 @@ def calibrate_from_rest(folder: Path, specimen: Path, face: list[str], tilt_sign
     Raises:
         InputError: a file cannot be read, or the markers do not determine a camera.
     """
-    announce_compilation()
     require_writable(out)
-    layout = read_layout(specimen)
     videos = open_rest_videos(folder)
-    faces = _values_by_camera("--face", face, list(videos), tuple(FACES))
     signs = _tilt_signs(tilt_sign, list(videos))
     table = create_table("camera", "face", "markers", "residual [px]", "px/mm", "sigma [px/mm]", "tilt [deg]")
     cameras: dict[str, Camera] = {}
-    with progress() as bar:
-        for name, video in videos.items():
-            task = bar.add_task(name, total=video.frames or None)
-            tick = partial(bar.advance, task)
-            view = solve_rest_camera(name, video, layout, faces.get(name), signs.get(name), tick)
-            camera, fit = view.fit.camera, view.fit
-            cameras[name] = camera
-            assert camera.covariance
-            tilt = (
-                f"below {np.degrees(fit.undetected_tilt):.1f}" if fit.undetected_tilt else f"{np.degrees(fit.tilt):.1f}"
-            )
-            numbers = (
-                f"{camera.residual:.3f}",
-                f"{1e-3 * camera.scale[0]:.4f}",
-                f"{camera.covariance[0][0] ** 0.5:.4f}",
-            )
-            table.add_row(name, view.face, str(view.markers), *numbers, tilt)
+    for name, view in _match_rest_videos(videos, specimen, face).items():
+        fit = camera_from_points(view.points, view.pixels, videos[name].size, name, signs.get(name))
+        camera = fit.camera
+        cameras[name] = camera
+        assert camera.covariance
+        tilt = f"below {np.degrees(fit.undetected_tilt):.1f}" if fit.undetected_tilt else f"{np.degrees(fit.tilt):.1f}"
+        numbers = (f"{camera.residual:.3f}", f"{1e-3 * camera.scale[0]:.4f}", f"{camera.covariance[0][0] ** 0.5:.4f}")
+        table.add_row(name, view.face, str(len(view.points)), *numbers, tilt)
     write_calibration(out, Rig(cameras))
     Console(width=110).print(table)
     typer.echo("assumed: square pixels, no lens distortion, no perspective; only a board shows whether they hold")
     _print_next(out)
+
+
+def place_calibration(calib: Path, unit: str | None, folder: Path, specimen: Path, face: list[str], out: Path) -> None:
+    """Place a calibration in the specimen frame by videos of the specimen at rest, print its cameras and write it.
+
+    Args:
+        calib: calibration of pinhole cameras.
+        unit: of the lengths in a calibration of another program that does not state it; None otherwise.
+        folder: one video per camera.
+        specimen: specimen description with the marker positions.
+        face: CAMERA=FACE, the face that a camera films.
+        out: calibration to write.
+
+    Raises:
+        InputError: a file cannot be read, or the markers do not determine the pose of the cameras.
+    """
+    require_writable(out)
+    videos = open_rest_videos(folder)
+    rig = read_any_calibration(calib, unit, lambda _: {name: video.size for name, video in videos.items()})
+    if set(rig.cameras) != set(videos):
+        raise InputError(
+            f"{folder}: expected a video of every camera in {calib} ({', '.join(rig.cameras)}), found those of "
+            f"{', '.join(videos)}; rename the videos after the cameras"
+        )
+    views = _match_rest_videos(videos, specimen, face)
+    placed = place_rig(rig, {name: KnownPoints(view.points, view.pixels) for name, view in views.items()})
+    write_calibration(out, placed)
+    table = create_table("camera", "face", "markers", "residual [px]")
+    for name, view in views.items():
+        table.add_row(name, view.face, str(len(view.points)), f"{placed.cameras[name].residual:.3f}")
+    Console(width=110).print(table)
+    _print_next(out)
+
+
+def _match_rest_videos(videos: dict[str, Video], specimen: Path, face: list[str]) -> dict[str, RestView]:
+    """The markers that each camera sees of the specimen at rest, with a progress bar."""
+    announce_compilation()
+    layout = read_layout(specimen)
+    faces = _values_by_camera("--face", face, list(videos), tuple(FACES))
+    views = {}
+    with progress() as bar:
+        for name, video in videos.items():
+            tick = partial(bar.advance, bar.add_task(name, total=video.frames or None))
+            views[name] = match_rest_video(name, video, layout, faces.get(name), tick)
+    return views
 
 
 def check_calibration(calib: Path, unit: str | None, images: Path, board: Path) -> None:
@@ -222,6 +258,7 @@ def track(
     rig = read_any_calibration(calib, unit, partial(_announce_filmed, calib, videos))
     settings = TrackingSettings(read_layout(specimen) if specimen else None, fps, fill, sync)
     layout = settings.layout
+    rig = with_face_planes(rig, layout) if layout else rig
     places = dict(zip(layout.names, layout.positions, strict=True)) if layout else {}
     found = find_videos(videos, rig, calib)
     recordings: dict[str, dict[str, Video]] = {}

@@ -1,4 +1,4 @@
-"""Camera calibration from videos of the specimen at rest: find and name its markers, then fit the camera."""
+"""Videos of the specimen at rest, which tell how its cameras stand: find and name its markers."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rafl.calibration.camera import OrthographicCamera
-from rafl.calibration.rest_pose import MIN_POINTS, RestCamera, camera_from_points
+from rafl.calibration.rest_pose import MIN_POINTS
 from rafl.common.errors import InputError
 from rafl.tracking.linking.follow import follow
 from rafl.tracking.linking.layout import MarkerLayout
@@ -35,17 +35,17 @@ MISFIT_RATIO = 1.5  # faces whose misfits are within this factor of the best can
 
 @dataclass(frozen=True)
 class RestView:
-    """A camera calibrated from its video of the specimen at rest.
+    """The markers that a camera sees of the specimen at rest.
 
     Attributes:
-        fit: the fitted camera.
         face: the face of the specimen that the camera films.
-        markers: number of the layout's markers that were found.
+        points: marker positions in the specimen frame [m], (P, 3).
+        pixels: their pixels, (P, 2).
     """
 
-    fit: RestCamera
     face: str
-    markers: int
+    points: Array
+    pixels: Array
 
 
 def open_rest_videos(folder: Path) -> dict[str, Video]:
@@ -62,10 +62,10 @@ def open_rest_videos(folder: Path) -> dict[str, Video]:
     return {path.name if path.is_dir() else path.stem: open_video(path) for path in paths}
 
 
-def solve_rest_camera(
-    name: str, video: Video, layout: MarkerLayout, face: str | None, tilt_sign: int | None, tick: Callable[[], None]
+def match_rest_video(
+    name: str, video: Video, layout: MarkerLayout, face: str | None, tick: Callable[[], None]
 ) -> RestView:
-    """Calibrate the camera that filmed a specimen at rest; the specimen frame is the world frame.
+    """Find the markers in a video of the specimen at rest.
 
     The camera must stand upright: up in the image is the specimen's z. If it films along z, right in the image is x.
 
@@ -74,11 +74,10 @@ def solve_rest_camera(
         video: the camera's video.
         layout: layout of the specimen's markers.
         face: one of `FACES`; None to try all.
-        tilt_sign: see `rafl.calibration.rest_pose.camera_from_points`.
         tick: called after every frame.
 
     Raises:
-        InputError: the dots move, match no face, match several faces equally well, or do not determine the camera.
+        InputError: the dots move, match no face, or match several faces equally well.
     """
     dots = _rest_positions(video, tick)
     matches: dict[str, tuple[Array, Array, float]] = {}
@@ -102,8 +101,7 @@ def solve_rest_camera(
             f"for instance --face {name}={equal[0]}"
         )
     points, pixels, _ = matches[equal[0]]
-    fit = camera_from_points(points, pixels, video.size, name, tilt_sign)
-    return RestView(fit, equal[0], len(points))
+    return RestView(equal[0], points, pixels)
 
 
 def _rest_positions(video: Video, tick: Callable[[], None]) -> Array:

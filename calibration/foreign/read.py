@@ -103,7 +103,7 @@ def _scale(path: Path, given: str | None, stated: float | None) -> float:
         raise InputError(f"expected a unit out of {', '.join(UNITS)}, found {given!r}")
     if stated is None and given is None:
         raise InputError(
-            f"{path} does not state the unit of its translations; expected it from you, for instance --calib-unit mm"
+            f"{path} does not state the unit of its translations; state it, for instance with --calib-unit mm"
         )
     if stated is not None and given is not None and not np.isclose(stated, UNITS[given]):
         raise InputError(f"{path} states a unit of {stated:g} m, found --calib-unit {given}; leave the option out")

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from support import ROOT, Run, assert_refused
 from typer.testing import CliRunner
 
-from rafl.calibration.camera import OrthographicCamera
+from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera
 from rafl.calibration.rest_pose import camera_from_points
 from rafl.calibration.rig import read_calibration
 from rafl.common.errors import InputError
@@ -34,7 +34,7 @@ def camera(face: str, tilt_deg: list[float], scale: float = 7.3e3) -> Orthograph
     )
 
 
-def write_rest_video(path: Path, truth: OrthographicCamera, face: str, shift: float = 0.0) -> None:
+def write_rest_video(path: Path, truth: Camera, face: str, shift: float = 0.0) -> None:
     """Ten frames of the dots of a face. In the last frame they are shifted by `shift` px."""
     path.parent.mkdir(exist_ok=True)
     markers = [k for k, name in enumerate(LAYOUT.names) if name.startswith("L" if face == "y-min" else "R")]
@@ -72,6 +72,44 @@ def test_two_cameras_with_one_face_each(run: Run, tmp_path: Path) -> None:
         assert (Rotation.from_matrix(item.rotation @ own.rotation.T)).magnitude() < np.radians(0.5)
         side = LAYOUT.positions[:16] if name == "left" else LAYOUT.positions[16:]
         np.testing.assert_allclose(item.project(side), own.project(side), atol=0.05)
+
+
+def test_a_stereo_pair_of_another_program_is_placed_on_the_specimen(run: Run, tmp_path: Path) -> None:
+    """Both cameras film one face; the file's world is the left camera's frame, and its unit the centimetre."""
+    truth, tables = {}, []
+    for name, angle in (("left", -12.0), ("right", 14.0)):
+        rotation = Rotation.from_euler("y", angle, degrees=True).as_matrix() @ FACING["y-min"]
+        translation = np.array([0.0, 0.0, 1.0]) - rotation @ [0.05, 0.015, 0.015]
+        truth[name] = PinholeCamera(
+            image_size=SIZE,
+            rotation_vector=tuple(Rotation.from_matrix(rotation).as_rotvec()),
+            focal=(7.3e3, 7.3e3),
+            centre=(480.0, 200.0),
+            translation=tuple(translation),
+            distortion=(-0.5, 0.0, 0.0, 0.0, 0.0),
+        )
+        write_rest_video(tmp_path / f"rest/{name}.mkv", truth[name], "y-min")
+        turn = rotation @ truth["left"].rotation.T
+        shift = translation - turn @ np.array(truth["left"].translation)
+        tables.append(
+            f'[{name}]\nname = "{name}"\nmatrix = [[7300.0, 0.0, 480.0], [0.0, 7300.0, 200.0], [0.0, 0.0, 1.0]]\n'
+            f"distortions = [-0.5, 0.0, 0.0, 0.0, 0.0]\nrotation = {turn.tolist()}\n"
+            f"translation = {(1e2 * shift).tolist()}\n"
+        )
+    (tmp_path / "stereo.toml").write_text("\n".join(tables))
+    options = ["--from-rest", "rest", "--specimen", SPECIMEN, "--calib", "stereo.toml", "--calib-unit", "cm"]
+    faces = ["--face", "left=y-min", "--face", "right=y-min"]
+    assert_refused(run("rafl-calibrate", *options, "--tilt-sign", "left=+"), "--tilt-sign")
+    result = run("rafl-calibrate", *options, *faces)
+    assert result.returncode == 0, result.stderr
+    found = read_calibration(tmp_path / "calib.yaml").cameras
+    for name, own in truth.items():
+        np.testing.assert_allclose(found[name].project(LAYOUT.positions), own.project(LAYOUT.positions), atol=0.2)
+        assert found[name].residual < 0.05
+    (tmp_path / "rest/right.mkv").rename(tmp_path / "rest/far.mkv")
+    (tmp_path / "calib.yaml").unlink()
+    assert_refused(run("rafl-calibrate", *options, *faces), "image size of camera right", "left")
+    assert not (tmp_path / "calib.yaml").exists()
 
 
 def test_unsuitable_rest_videos_are_refused(run: Run, tmp_path: Path) -> None:

@@ -2,13 +2,15 @@
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from rafl.calibration.camera import Camera
+from rafl.calibration.camera import Camera, PinholeCamera, Plane
+from rafl.calibration.rig import PLANE_SIGMA_MM, Rig
 from rafl.common.errors import InputError
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.linking.matching import MarkerPattern, match_at_rest
@@ -42,6 +44,46 @@ def visible_markers(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
     on = np.abs(points @ normals.T + offsets) < 1e-3 * np.ptp(points, axis=0).max()
     facing = normals @ camera.viewing_direction < -0.5
     return np.flatnonzero((on & facing).any(axis=1))
+
+
+def with_face_planes(rig: Rig, layout: MarkerLayout) -> Rig:
+    """The rig with planes for cameras that have none and see markers that no other camera sees.
+
+    The plane is that of the markers on the side of the undeformed specimen that faces the camera, if they lie in one.
+
+    Raises:
+        InputError: a pinhole camera has the specimen behind it, or wholly outside its image.
+    """
+    visible = {}
+    for name, camera in rig.cameras.items():
+        if isinstance(camera, PinholeCamera):
+            _check_in_view(name, camera, layout)
+        visible[name] = visible_markers(layout, camera)
+    cameras = dict(rig.cameras)
+    for name, camera in rig.cameras.items():
+        shared = any(np.isin(visible[name], own).any() for other, own in visible.items() if other != name)
+        if camera.plane is None and not shared and len(visible[name]) >= MIN_MATCHED_DOTS:
+            points = layout.positions[visible[name]]
+            middle = points.mean(axis=0)
+            normal = np.linalg.svd(points - middle)[2][2]
+            normal *= -np.sign(normal @ camera.viewing_direction)  # towards the camera
+            if np.abs((points - middle) @ normal).max() <= 1e-3 * PLANE_SIGMA_MM:
+                plane = Plane(tuple(normal.tolist()), float(normal @ middle), 1e-3 * PLANE_SIGMA_MM)
+                cameras[name] = replace(camera, plane=plane)
+    return Rig(cameras)
+
+
+def _check_in_view(name: str, camera: PinholeCamera, layout: MarkerLayout) -> None:
+    """Refuse a camera that cannot see the undeformed specimen: then the world is not the specimen frame."""
+    depth = layout.positions @ camera.rotation[2] + camera.translation[2]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels = camera.project_undistorted(layout.positions)
+    inside = (depth > 0) & (pixels >= 0).all(axis=1) & (pixels < camera.image_size).all(axis=1)
+    if not inside.any():
+        raise InputError(
+            f"camera {name}: expected the specimen in its image, found none of its markers there; the world of the "
+            "calibration is not the specimen frame: place it with rafl-calibrate --from-rest REST --calib CALIBRATION"
+        )
 
 
 def _uncovered_markers(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:

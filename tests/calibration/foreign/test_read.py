@@ -55,7 +55,7 @@ def test_calib_yaml_is_read_and_states_its_unit(tmp_path: Path) -> None:
 
 def test_units_and_names_are_not_guessed(tmp_path: Path) -> None:
     write_aniposelib(tmp_path / "calibration.toml")
-    with pytest.raises(InputError, match=r"does not state the unit of its translations.*--calib-unit mm"):
+    with pytest.raises(InputError, match=r"does not state the unit of its translations; .*--calib-unit mm"):
         read_any_calibration(tmp_path / "calibration.toml")
     with pytest.raises(InputError, match="expected a unit out of mm, cm, m, found 'feet'"):
         read_any_calibration(tmp_path / "calibration.toml", "feet")

@@ -3,10 +3,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support import ROOT
 
-from rafl.calibration.camera import OrthographicCamera
+from rafl.calibration.camera import OrthographicCamera, PinholeCamera
+from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
 from rafl.tracking.linking.layout import MarkerLayout, read_layout
-from rafl.tracking.linking.naming import name_by_layout, name_by_rows, visible_markers
+from rafl.tracking.linking.naming import name_by_layout, name_by_rows, visible_markers, with_face_planes
 
 CAMERA = OrthographicCamera(
     image_size=(1280, 720), scale=(9000.0, 9000.0), rotation_vector=(np.pi / 2, 0.0, 0.0), offset=(150.0, 400.0)
@@ -162,3 +163,44 @@ def test_rows_of_a_bent_beam(random: np.random.Generator) -> None:
     names = name_by_rows(dots.reshape(-1, 2)[mixed])
     expected = [f"r{row + 1}c{column + 1}" for row in range(3) for column in range(10)]
     assert names == [expected[k] for k in mixed]
+
+
+def facing(rotation_vector: tuple[float, float, float]) -> PinholeCamera:
+    """A pinhole camera 2 m from the beam's middle."""
+    turn = Rotation.from_rotvec(rotation_vector).as_matrix()
+    shift = np.array([0.0, 0.0, 2.0]) - turn @ [0.05, 0.015, 0.015]
+    return PinholeCamera(
+        image_size=(1280, 720),
+        rotation_vector=rotation_vector,
+        focal=(18000.0, 18000.0),
+        centre=(640.0, 360.0),
+        translation=tuple(shift.tolist()),
+    )
+
+
+def test_cameras_that_share_no_markers_get_the_planes_of_their_faces() -> None:
+    left = facing((np.pi / 2, 0.0, 0.0))
+    right = facing(tuple(Rotation.from_matrix([[-1.0, 0, 0], [0, 0, -1.0], [0, -1.0, 0]]).as_rotvec().tolist()))
+    cameras = with_face_planes(Rig({"left": left, "right": right}), LAYOUT).cameras
+    for name, normal, offset in (("left", -1.0, 0.0), ("right", 1.0, 0.03)):
+        plane = cameras[name].plane
+        assert plane is not None
+        np.testing.assert_allclose(plane.normal, [0.0, normal, 0.0], atol=1e-12)
+        assert plane.offset == pytest.approx(offset)
+    beside = facing((np.pi / 2, 0.1, 0.0))
+    shared = with_face_planes(Rig({"left": left, "beside": beside}), LAYOUT).cameras
+    assert shared["left"].plane is None
+    assert shared["beside"].plane is None
+
+
+def test_a_world_that_is_not_the_specimen_frame_is_refused() -> None:
+    """The world of a stereo pair is the first camera's frame. There the specimen's places are in the camera."""
+    own = PinholeCamera(
+        image_size=(1280, 720),
+        rotation_vector=(0.0, 0.0, 0.0),
+        focal=(9e3, 9e3),
+        centre=(640.0, 360.0),
+        translation=(0.0, 0.0, 0.0),
+    )
+    with pytest.raises(InputError, match=r"camera left: .* not the specimen frame: place it with rafl-calibrate"):
+        with_face_planes(Rig({"left": own}), LAYOUT)
