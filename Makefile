@@ -7,7 +7,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 # BLAS threads would compete with the simulator's own.
 export OPENBLAS_NUM_THREADS := 1
 
-.PHONY: install demo test test-slow lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
+.PHONY: install demo test test-slow fuzz lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
 	bench-simulator bench-tracking bench-paper bench-capture bench-sim2real bench-labs bench-laws bench-mesh laws clean
 
 install: $(VENV)/installed $(VENV)/kernels
@@ -73,6 +73,11 @@ check-wheel: wheel
 # Tests that need the recordings and reference trajectories beside the checkout; skipped if they are absent.
 real: install
 	SHARED=$(SHARED) $(BIN)/pytest -m "real or reference" -rs
+
+# Files of every format changed as damage and malice change them, and faults of the system (SEED=number for others).
+fuzz: install
+	OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 PYTHONPATH=tests/helpers \
+		$(BIN)/python tests/fuzz/fuzz.py --trials $(or $(TRIALS),1000) --seed $(or $(SEED),0)
 
 # Elastic laws compared with tensile tests of silicone rubbers.
 bench-laws: install

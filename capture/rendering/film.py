@@ -153,7 +153,7 @@ def write_board_images(folder: Path, rig: Rig, appearance: Appearance, random: n
     pixels_per_metre = min(
         float(np.linalg.norm(camera.projection_jacobian(world_origin)[0])) for camera in rig.cameras.values()
     )
-    pattern = _board_for(tuple(size / pixels_per_metre for size in IMAGE_SIZE))
+    pattern = board_for(tuple(size / pixels_per_metre for size in IMAGE_SIZE))
     squares = pattern.squares
     print_scale = SQUARE_PRINT_PX / pattern.square_mm  # print pixels per mm
     texture = pattern.opencv_board().generateImage(
@@ -193,7 +193,7 @@ def write_board_images(folder: Path, rig: Rig, appearance: Appearance, random: n
     write_text(folder / "board.yaml", yaml.safe_dump(description, sort_keys=False, default_flow_style=None))
 
 
-def _board_for(view: tuple[float, ...]) -> CharucoPattern:
+def board_for(view: tuple[float, ...]) -> CharucoPattern:
     """A board that fills most of a view (width, height) [m]: larger squares where the dictionary lacks markers."""
     square = SQUARE_MM
     while True:

@@ -12,7 +12,7 @@ from scipy.ndimage import label
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 from rafl.common.names import PathInside
-from rafl.common.yaml_files import StrictModel
+from rafl.common.yaml_files import LARGEST, StrictModel
 from rafl.fem.mesh import HexMesh
 
 SURFACES = (".stl", ".obj", ".ply")
@@ -172,14 +172,15 @@ def read_surface(path: Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in SURFACES:
         raise InputError(f"expected a surface ({', '.join(SURFACES)}), found {path}; export it in one of these")
     try:
-        surface = trimesh.load_mesh(path, skip_materials=True)
+        with np.errstate(all="ignore"):  # of damaged numbers, which are refused below
+            surface = trimesh.load_mesh(path, skip_materials=True)
     except Exception as error:  # its readers raise many kinds on damaged files; all mean the same to the user
         reason = " ".join(str(error).split())
         raise InputError(
             f"expected a surface in {path}, which cannot be read: {reason:.120}; export it again"
         ) from None
-    if isinstance(surface, trimesh.Trimesh) and not np.isfinite(surface.vertices).all():
-        raise InputError(f"surface {path}: expected finite coordinates, found others; export it again")
+    if isinstance(surface, trimesh.Trimesh) and not (np.abs(surface.vertices) < LARGEST).all():
+        raise InputError(f"surface {path}: expected coordinates in mm, found infinite ones; export it again")
     if not isinstance(surface, trimesh.Trimesh) or len(surface.faces) == 0:
         raise InputError(f"expected triangles in {path}, found none; export it again as a mesh")
     if not surface.is_watertight:

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from rafl.calibration.camera import OrthographicCamera
-from rafl.capture.rendering.film import exposure_positions, side_cameras
+from rafl.capture.rendering.film import board_for, exposure_positions, side_cameras
 from rafl.capture.rendering.motion import SimulatedMotion, tip_load_release, twist_release
 from rafl.capture.rendering.render import Appearance, Renderer
 from rafl.capture.specimen.specimen import Specimen
@@ -69,3 +69,15 @@ def test_a_twist_rotates_the_tip_and_keeps_the_clamp_fixed(small_specimen: Speci
     quarter = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
     np.testing.assert_allclose(first[tip] - centre, (rest[tip] - centre) @ quarter.T, atol=1e-12)
     assert motion.load == 0.0
+
+
+@pytest.mark.parametrize(
+    ("view", "squares", "square_mm"), [((0.13, 0.07), (11, 6), 10.0), ((1.1, 0.62), (25, 14), 40.0)]
+)
+def test_board_has_no_more_markers_than_its_dictionary(
+    view: tuple[float, float], squares: tuple[int, int], square_mm: float
+) -> None:
+    pattern = board_for(view)
+    assert (pattern.squares, pattern.square_mm) == (squares, square_mm)
+    assert len(pattern.opencv_board().getIds()) <= 250
+    assert min(board_for((0.02, 0.011)).squares) >= 5

@@ -1,9 +1,12 @@
+import os
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from rafl.common.errors import InputError
-from rafl.common.files import atomic_file, sha256
+from rafl.common.files import atomic_file, new_content, require_writable, sha256, write_bytes, written_texts
 from rafl.common.yaml_files import StrictModel, check_format, read_yaml
 
 
@@ -40,6 +43,59 @@ def test_folder_instead_of_a_file_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found a folder"), atomic_file(tmp_path):
         pass
     assert not list(tmp_path.parent.glob(f".{tmp_path.name}*"))
+
+
+def test_full_disk_is_told_with_what_was_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: SimpleNamespace(free=1_500_000))
+    with pytest.raises(OSError, match=r"expected 2.00 MB of free space to write it, found 1.50 MB") as error:
+        write_bytes(tmp_path / "new" / "a.h5", bytes(2_000_000))
+    assert error.value.filename == str(tmp_path / "new" / "a.h5")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_files_take_their_places_together(tmp_path: Path) -> None:
+    old, new, folder = tmp_path / "a.csv", tmp_path / "out" / "b.csv", tmp_path / "c.csv"
+    old.write_text("old")
+    with written_texts({old: "new", new: "new"}):
+        assert old.read_text() == "old"
+    assert (old.read_text(), new.read_text()) == ("new", "new")
+    folder.mkdir()
+    with pytest.raises(InputError, match="found a folder"), written_texts({old: "newer", folder: "newer"}):
+        pass
+    with pytest.raises(ZeroDivisionError), written_texts({old: "newer", tmp_path / "more" / "d.csv": "newer"}):
+        raise ZeroDivisionError
+    assert old.read_text() == "new"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "c.csv", "out"]
+
+
+def test_content_that_fails_leaves_the_folder_as_it_was(tmp_path: Path) -> None:
+    (tmp_path / "kept").write_text("")
+
+    def film(folder: Path) -> None:
+        with new_content(folder):
+            (folder / "video").mkdir()
+            (folder / "video" / "left.mp4").write_text("")
+            raise ZeroDivisionError
+
+    for folder in (tmp_path, tmp_path / "a" / "b"):
+        with pytest.raises(ZeroDivisionError):
+            film(folder)
+    assert [path.name for path in tmp_path.rglob("*")] == ["kept"]
+
+
+def test_place_that_cannot_be_written_to_is_found_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    require_writable(tmp_path / "file")
+    require_writable(tmp_path / "new" / "run")
+    with pytest.raises(InputError, match=r"expected a folder at .*file, found a file"):
+        require_writable(tmp_path / "file" / "run")
+
+    def refuse(*_: object, **__: object) -> int:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(os, "open", refuse)
+    with pytest.raises(InputError, match="run: expected to be able to write there, found: Permission denied"):
+        require_writable(tmp_path / "run")
 
 
 @pytest.mark.parametrize(
