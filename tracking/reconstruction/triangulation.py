@@ -101,8 +101,8 @@ def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array
         if rig.cameras[name].plane is None:
             if (seen[name] & alone).any() and not (_count(seen) > 1).any():
                 raise InputError(
-                    f"camera {name} alone sees the markers, and the calibration gives it no plane; add "
-                    f"`plane: {{normal: ..., offset_mm: ...}}` to camera {name} in calib.yaml"
+                    f"camera {name} alone sees the markers, and the calibration gives it no plane; name the "
+                    "markers with --specimen, or add `plane: {normal: ..., offset_mm: ...}` to the camera in calib.yaml"
                 )
             seen[name] = seen[name] & ~alone
     solution = _Solution.of(rig, pixels, ideal, seen)
