@@ -21,7 +21,10 @@ def recordings_table(dataset: Dataset) -> Table:
     for name, item in dataset.trajectories.items():
         values = item.attributes
         averaged = int(str(values.get("still_frames", 0)))
-        first_frame = f"{values.get('first_frame', '-')}" + (f" (mean of {averaged} before)" if averaged else "")
+        state = (
+            f" (mean of {averaged} before)" if averaged else " (moving)" if values.get("initial") == "moving" else ""
+        )
+        first_frame = f"{values.get('first_frame', '-')}{state}"
         table.add_row(
             name,
             item.split,
@@ -40,7 +43,7 @@ def _number(value: object, format_spec: str) -> str:
 
 
 def warnings(dataset: Dataset) -> list[str]:
-    """One message for each misplaced marker and each recording in which the registration left markers out."""
+    """Messages on misplaced markers, markers left out, and frames that are not free."""
     lines = []
     moved = dataset.markers.moved
     distances = np.zeros(len(dataset.markers.names)) if moved is None else 1e3 * np.linalg.norm(moved, axis=1)
@@ -60,6 +63,13 @@ def warnings(dataset: Dataset) -> list[str]:
             lines.append(
                 f"recording {name}: {outliers} too far from the position in the specimen's layout, left out; correct "
                 "at_mm, or the names in the tracks"
+            )
+        start, not_free = (int(str(item.attributes.get(key, 0))) for key in ("first_frame", "not_free_frames"))
+        if not_free:
+            lines.append(
+                f"recording {name}: expected a free motion from the release on, found none in frames "
+                f"{start - not_free} to {start - 1} (a hand, a slack string, or a load that touches again); it starts "
+                f"after them"
             )
     return lines
 
