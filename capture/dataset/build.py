@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rafl.capture.dataset.modulus import estimate_modulus
 from rafl.capture.dataset.naming import in_layout_order
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
@@ -120,7 +121,7 @@ def build_dataset(
     empty = replace(empty, markers=markers)
     trajectories = {}
     for item in registered:
-        trajectories[item.row.recording] = _trajectory(empty, specimen, item, settings)
+        trajectories[item.row.recording] = _with_modulus(_trajectory(empty, specimen, item, settings), empty, specimen)
         tick()
     dataset = Dataset(specimen.name, simulator, markers, trajectories, recipe)
     try:
@@ -292,6 +293,15 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, setting
             "source": recording.source,
         },
     )
+
+
+def _with_modulus(item: Trajectory, dataset: Dataset, specimen: Specimen) -> Trajectory:
+    """The recording with the moduli that it shows by itself as attributes."""
+    hung = item.attributes["load"] == "released" and item.attributes["initial"] != "moving"
+    load = 1e-3 * float(str(item.attributes["load_g"])) if hung else 0.0
+    found = estimate_modulus(dataset.simulator, dataset.markers, item, specimen.loaded, load)
+    measured = {"bend_modulus": found.bend, "swing_modulus": found.swing, "swing_hz": found.frequency}
+    return replace(item, attributes=item.attributes | measured)
 
 
 def _fit_initial_state(

@@ -7,6 +7,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from rafl.capture.dataset.contradictions import contradictions
 from rafl.common.command_line import create_table
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
@@ -43,7 +44,7 @@ def _number(value: object, format_spec: str) -> str:
 
 
 def warnings(dataset: Dataset) -> list[str]:
-    """Messages on misplaced markers, markers left out, and frames that are not free."""
+    """Messages on misplaced markers, markers left out, frames that are not free, and quantities that contradict."""
     lines = []
     moved = dataset.markers.moved
     distances = np.zeros(len(dataset.markers.names)) if moved is None else 1e3 * np.linalg.norm(moved, axis=1)
@@ -71,7 +72,7 @@ def warnings(dataset: Dataset) -> list[str]:
                 f"{start - not_free} to {start - 1} (a hand, a slack string, or a load that touches again); it starts "
                 f"after them"
             )
-    return lines
+    return lines + contradictions(dataset)
 
 
 def print_contents(path: Path, console: Console) -> None:
