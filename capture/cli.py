@@ -100,6 +100,7 @@ def _numbers(text: str, option: str, low: float) -> list[float]:
 class Initial(StrEnum):
     """State of the specimen in the first frame, and how it is fitted."""
 
+    auto = "auto"
     rest = "rest"
     moving = "moving"
     sequence = "sequence"
@@ -228,9 +229,10 @@ def capture(
     initial: Annotated[
         Initial,
         typer.Option(
-            help="First frame: at rest; moving; or at rest, fitted by the slower method of earlier work (sequence)."
+            help="First frame: at rest or moving, as each recording shows (auto); at rest; moving; or at rest, fitted "
+            "by the slower method of earlier work (sequence)."
         ),
-    ] = Initial.rest,
+    ] = Initial.auto,
     forces: Annotated[Forces, typer.Option(help="Where the virtual forces of the first frame act.")] = Forces.tip,
     fps: Annotated[
         float, typer.Option(min=0.1, help="Frames per second of files that do not name it (npy, DLTdv, ...).")

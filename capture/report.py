@@ -30,9 +30,15 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}
 <p class="note">Registration: largest distance of a marker from its layout position after the transform to the specimen
 frame. First frame fit: root mean square distance between the markers of the fitted mesh and the recorded ones.</p>
 <table><tr><th>recording</th><th>split</th><th>load [g]</th><th>frames</th><th>valid</th><th>first frame</th>
-<th>found from</th><th>frames averaged</th><th>registered by</th><th>registration [mm]</th>
+<th>found from</th><th>state</th><th>frames averaged</th><th>registered by</th><th>registration [mm]</th>
 <th>first frame fit [mm]</th></tr>
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
+<h2>Young's modulus</h2>
+<p class="note">Each recording shows it twice: by the bend under the load that was released, and by the frequency of the
+swing. The two depend on different quantities: the load, or the frame rate and the density. The specimen's description
+has {{ assumed }} kPa.</p>
+<table><tr><th>recording</th><th>bend [kPa]</th><th>swing [kPa]</th><th>frequency [Hz]</th></tr>
+{% for row in moduli %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 <h2>First frames</h2>
 <p class="note">Blue: fitted mesh. Red: recorded markers.
 {% if not_shown %}{{ not_shown }} more recordings are not shown.{% endif %}</p>
@@ -78,6 +84,8 @@ def dataset_page(specimen: Specimen, dataset: Dataset) -> str:
                 for k, marker in enumerate(dataset.markers.names)
             ],
             places=_places(dataset.markers),
+            assumed=f"{1e-3 * dataset.simulator.material.youngs_modulus:.3g}",
+            moduli=[_moduli(name, item.attributes) for name, item in items.items()],
             registrations=[_registration(name, item.attributes) for name, item in items.items()],
         )
     )
@@ -93,11 +101,19 @@ def _row(name: str, dataset: Dataset) -> list[object]:
         f"{item.valid.mean():.1%}",
         values["first_frame"],
         values["first_frame_from"],
+        "moving" if values["initial"] == "moving" else "at rest",
         values["still_frames"],
         values["registration"],
         f"{values['registration_residual_mm']:.3f}",
         f"{values['fit_residual_mm']:.3f}",
     ]
+
+
+def _moduli(name: str, values: dict[str, object]) -> list[str]:
+    """Row of the table of moduli; a dash where one cannot be measured."""
+    numbers = [float(str(values[key])) for key in ("bend_modulus", "swing_modulus", "swing_hz")]
+    scaled = [1e-3 * numbers[0], 1e-3 * numbers[1], numbers[2]]
+    return [name, *(f"{value:.3g}" if np.isfinite(value) else "-" for value in scaled)]
 
 
 def _places(markers: Markers) -> list[list[str]]:

@@ -9,10 +9,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rafl.capture.dataset.modulus import estimate_modulus
 from rafl.capture.dataset.naming import in_layout_order
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.initial import FirstFrame, InitialState, fit_first_frame, fit_velocity
+from rafl.capture.registration.motion_start import MotionStart, find_motion_start
 from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import (
@@ -23,7 +25,6 @@ from rafl.capture.registration.registration import (
     fit_rest,
     register,
 )
-from rafl.capture.registration.release import Release, find_release
 from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, pose_sigma
 from rafl.capture.registration.sequence import fit_by_sequence
 from rafl.capture.specimen.specimen import Specimen
@@ -34,8 +35,7 @@ from rafl.data.synthetic import load_force
 
 Array = NDArray[Any]
 
-# Frames on each side of the first one; the polynomial through all of them gives the velocity in the first frame.
-VELOCITY_WINDOW_FRAMES = 2
+VELOCITY_WINDOW_FRAMES = 5  # the polynomial through all of them gives the velocity in the first frame
 SAME_PLACE = 1e-9  # [m]
 
 
@@ -50,8 +50,8 @@ class CaptureSettings:
         rest: frames that show the undeformed specimen, if recorded.
         moving_clamp: express the positions in the frame of the clamp markers, if there are any.
         start: first frame of the recordings whose row has none; None finds it from the motion.
-        initial: `rest`: the first frame is an equilibrium; `moving`: it has a velocity; `sequence`: as `rest`, fitted
-            by a sequence of forces over time.
+        initial: `rest`: the first frame is an equilibrium; `moving`: it has a velocity; `auto`: either, as each
+            recording shows; `sequence`: as `rest`, fitted by a sequence of forces over time.
         forces: virtual forces act on the `tip` or on the whole `surface`.
         unit: of positions in tables that do not name it: m, cm or mm.
         names: of markers in the specimen, by their names in the files, where they differ.
@@ -63,7 +63,7 @@ class CaptureSettings:
     rest: RestPose | None = None
     moving_clamp: bool = True
     start: int | None = None
-    initial: Literal["rest", "moving", "sequence"] = "rest"
+    initial: Literal["auto", "rest", "moving", "sequence"] = "auto"
     forces: Literal["tip", "surface"] = "tip"
     unit: str | None = None
     names: dict[str, str] = field(default_factory=dict)
@@ -121,7 +121,7 @@ def build_dataset(
     empty = replace(empty, markers=markers)
     trajectories = {}
     for item in registered:
-        trajectories[item.row.recording] = _trajectory(empty, specimen, item, settings)
+        trajectories[item.row.recording] = _with_modulus(_trajectory(empty, specimen, item, settings), empty, specimen)
         tick()
     dataset = Dataset(specimen.name, simulator, markers, trajectories, recipe)
     try:
@@ -160,8 +160,7 @@ class _Registered:
     Attributes:
         recording, row, registration: of which it is made.
         position, sigma: of the specimen's markers [m], (T, M, 3).
-        release: where the motion starts.
-        release_source: where that was found.
+        start: where the motion starts, and in which state.
         last: last frame that is used.
     """
 
@@ -170,8 +169,7 @@ class _Registered:
     registration: Registration
     position: Array
     sigma: Array
-    release: Release
-    release_source: str
+    start: MotionStart
     last: int
 
     @classmethod
@@ -183,20 +181,20 @@ class _Registered:
         registration: Registration,
         settings: CaptureSettings,
     ) -> "_Registered":
-        """Transform a recording by its registration, without outliers, and find its release."""
+        """Transform a recording by its registration, without outliers, and find where its motion starts."""
         own = len(specimen.layout.names)
         position = registration.pose.apply(recording.position[:, :own])
         sigma = registration.pose.rotate_sigma(recording.sigma[:, :own])
         position[:, [name in registration.outliers for name in specimen.layout.names]] = np.nan
         # Positions as recorded: if a clamp marker jumps, a specimen at rest would seem to move in the clamp's frame.
-        release, source = _release_and_source(recording.position[:, :own], row, settings)
+        start = _motion_start(recording.position[:, :own], row, settings)
         last = len(recording.time) - 1 if row.last_frame is None else row.last_frame
-        if not release.start < last < len(recording.time):
+        if not start.frame < last < len(recording.time):
             raise InputError(
                 f"recording {row.recording}: expected frames within 0 to {len(recording.time) - 1}, found "
-                f"{release.start} to {last}; correct recordings.csv"
+                f"{start.frame} to {last}; correct recordings.csv"
             )
-        return cls(recording, row, registration, position, sigma, release, source, last)
+        return cls(recording, row, registration, position, sigma, start, last)
 
     def with_pose(self, places: Places) -> "_Registered":
         """The recording in the specimen frame, after its pose was found; sigma then contains that of the pose."""
@@ -215,12 +213,12 @@ class _Registered:
 
     def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
         """Mean marker positions at rest before the release, or those of the first frame."""
-        rest = slice(self.release.rest_start, max(self.release.start, self.release.rest_start + 1))
+        rest = slice(self.start.rest_start, max(self.start.frame, self.start.rest_start + 1))
         target, sigma = average_frames(self.position[rest], self.sigma[rest])
         name = self.row.recording
         if np.isfinite(target[:, 0]).sum() < MIN_MARKERS:
             raise InputError(
-                f"recording {name}, frame {self.release.start}: expected at least {MIN_MARKERS} markers, found fewer; "
+                f"recording {name}, frame {self.start.frame}: expected at least {MIN_MARKERS} markers, found fewer; "
                 "start at a later first_frame"
             )
         surface = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
@@ -238,7 +236,7 @@ def _find_places(
     """The markers at the places that the first frames show, and the recordings with the poses that these show.
 
     Places stay as described where the elements lock: such a mesh follows a bent body less closely than a hand places a
-    dot. First frames that are no equilibria show neither places nor poses.
+    dot. A recording that starts in motion shows neither places nor a pose, for its first frame is no equilibrium.
 
     Args:
         dataset: with the markers as described.
@@ -252,21 +250,25 @@ def _find_places(
     """
     markers = known or dataset.markers
     fixed = known is not None or specimen.material.integration != "enhanced"
-    chosen = [k for k, item in enumerate(registered) if item.registration.pose_from_model or not fixed]
-    if settings.initial == "moving" or not chosen:
+    chosen = [item for item in registered if not item.start.moving and (item.registration.pose_from_model or not fixed)]
+    if not chosen:
         return markers, registered
     described = replace(dataset, markers=markers)
-    frames = [registered[k].first_frame(described, specimen, whole_surface=False) for k in chosen]
-    unknown = [registered[k].registration.pose_from_model for k in chosen]
+    unknown = [item.registration.pose_from_model for item in chosen]
+    frames = [item.first_frame(described, specimen, whole_surface=False) for item in chosen]
     frames = [
-        replace(frame, load=1e-3 * registered[k].row.load_g) if posed else frame
-        for k, frame, posed in zip(chosen, frames, unknown, strict=True)
+        replace(frame, load=1e-3 * item.row.load_g) if posed else frame
+        for item, frame, posed in zip(chosen, frames, unknown, strict=True)
     ]
-    targets = [frame.target for frame, posed in zip(frames, unknown, strict=True) if posed]
-    pose = fit_pose_near_clamp(specimen, np.nanmean(targets, axis=0)) if targets else IDENTITY
+    targets = np.array([frame.target for frame, posed in zip(frames, unknown, strict=True) if posed])
+    pose = IDENTITY
+    if len(targets):
+        pose = fit_pose_near_clamp(specimen, average_frames(targets, np.ones_like(targets))[0])
     sigma = 0.0 if fixed else specimen.layout.sigma
     places = find_places(frames, unknown, pose, np.broadcast_to(sigma, len(markers.names)))
-    found = [item.with_pose(places) if item.registration.pose_from_model else item for item in registered]
+    found = [
+        item.with_pose(places) if any(unknown) and item.registration.pose_from_model else item for item in registered
+    ]
     if not fixed:
         _check_places(specimen, dataset.markers, places.markers, settings)
     return markers if fixed else places.markers, found
@@ -287,19 +289,19 @@ def _check_places(specimen: Specimen, described: Markers, markers: Markers, sett
 def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, settings: CaptureSettings) -> Trajectory:
     """One recording from its release on, at even times, with its first frame fitted."""
     simulator, recording, row, registration = dataset.simulator, item.recording, item.row, item.registration
-    position, sigma, release = item.position, item.sigma, item.release
+    position, sigma, start = item.position, item.sigma, item.start
     frame = item.first_frame(dataset, specimen, settings.forces == "surface")
     initial = _fit_initial_state(frame, specimen, registration, settings)
     position, sigma = initial.pose.apply(position), initial.pose.rotate_sigma(sigma)
     velocity = np.zeros_like(initial.q)
-    if settings.initial == "moving":
-        velocity = fit_velocity(frame, initial.q, *_marker_velocity(position, sigma, recording.time, release.start))
+    if start.moving:
+        velocity = fit_velocity(frame, initial.q, *_marker_velocity(position, sigma, recording.time, start))
     load = 1e-3 * row.load_g if row.load == "hanging" else 0.0
     added_mass = np.zeros(len(specimen.mesh.vertices))
     added_mass[specimen.loaded] = load / len(specimen.loaded)
-    chosen = slice(release.start, item.last + 1)
+    chosen = slice(start.frame, item.last + 1)
     time, markers, sigma = _on_even_grid(recording, position, sigma, chosen, simulator.time_step, row)
-    first = slice(release.start, release.start + 1)
+    first = slice(start.frame, start.frame + 1)
     pose = initial.pose if registration.pose_from_model else registration.pose.select_frames(first)
     residual = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - initial.pose.apply(frame.target)
     return Trajectory(
@@ -325,16 +327,26 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, setting
             "registration_modulus": registration.modulus,
             "registration_modulus_sigma": registration.modulus_sigma,
             "set_aside": ", ".join(registration.outliers),
-            "first_frame": release.start,
-            "first_frame_from": item.release_source,
-            "still_frames": release.start - release.rest_start,
-            "initial": settings.initial,
+            "first_frame": start.frame,
+            "first_frame_from": start.source,
+            "still_frames": start.frame - start.rest_start,
+            "not_free_frames": start.not_free,
+            "initial": settings.initial if settings.initial == "sequence" else "moving" if start.moving else "rest",
             "forces": settings.forces,
             "fit_residual_mm": 1e3 * initial.residual,
             "fit_markers_mm": 1e3 * np.linalg.norm(residual, axis=1),
             "source": recording.source,
         },
     )
+
+
+def _with_modulus(item: Trajectory, dataset: Dataset, specimen: Specimen) -> Trajectory:
+    """The recording with the moduli that it shows by itself as attributes."""
+    hung = item.attributes["load"] == "released" and item.attributes["initial"] != "moving"
+    load = 1e-3 * float(str(item.attributes["load_g"])) if hung else 0.0
+    found = estimate_modulus(dataset.simulator, dataset.markers, item, specimen.loaded, load)
+    measured = {"bend_modulus": found.bend, "swing_modulus": found.swing, "swing_hz": found.frequency}
+    return replace(item, attributes=item.attributes | measured)
 
 
 def _fit_initial_state(
@@ -358,31 +370,31 @@ def _fit_initial_state(
     return initial
 
 
-def _release_and_source(position: Array, row: RecordingRow, settings: CaptureSettings) -> tuple[Release, str]:
-    """Release frame, and where it comes from: the motion, the user or the beginning of the recording."""
+def _motion_start(position: Array, row: RecordingRow, settings: CaptureSettings) -> MotionStart:
+    """First frame and its state, by recordings.csv, the settings and the recorded motion."""
     given = settings.start if row.first_frame is None else row.first_frame
-    if given is None and settings.initial != "moving":
-        return find_release(position), "the motion"
-    start = given or 0
-    if start >= len(position):
+    if given is not None and given >= len(position):
         raise InputError(
-            f"recording {row.recording}: expected a first frame within 0 to {len(position) - 1}, found {start}; "
+            f"recording {row.recording}: expected a first frame within 0 to {len(position) - 1}, found {given}; "
             "correct it"
         )
-    rest_start = start if settings.initial == "moving" else find_release(position, start).rest_start
-    return Release(start, rest_start), "given" if given is not None else "the beginning"
+    return find_motion_start(position, "rest" if settings.initial == "sequence" else settings.initial, given)
 
 
-def _marker_velocity(position: Array, sigma: Array, time: Array, start: int) -> tuple[Array, Array]:
-    """Marker velocities in a frame and their sigmas [m/s], (M, 3), by polynomials through near frames."""
-    end = min(max(start + VELOCITY_WINDOW_FRAMES, 2 * VELOCITY_WINDOW_FRAMES), len(time) - 1)
-    near = slice(max(start - VELOCITY_WINDOW_FRAMES, 0), end + 1)
-    powers = np.vander(time[near] - time[start], 2 * VELOCITY_WINDOW_FRAMES + 1, increasing=True)
+def _marker_velocity(position: Array, sigma: Array, time: Array, start: MotionStart) -> tuple[Array, Array]:
+    """Marker velocities in the first frame and their sigmas [m/s], (M, 3), by polynomials through near frames.
+
+    Frames before it count only if it is given: the specimen need not be free in them.
+    """
+    before = VELOCITY_WINDOW_FRAMES // 2 if start.source == "given" else 0
+    first = max(start.frame - before, 0)
+    near = slice(first, min(first + VELOCITY_WINDOW_FRAMES, len(time)))
+    powers = np.vander(time[near] - time[start.frame], VELOCITY_WINDOW_FRAMES, increasing=True)
     velocity, velocity_sigma = np.full(position.shape[1:], np.nan), np.full(position.shape[1:], np.inf)
     for marker in range(position.shape[1]):
         for axis in range(3):
             measured = np.isfinite(position[near, marker, axis])
-            if measured.sum() > 2 * VELOCITY_WINDOW_FRAMES:
+            if measured.sum() >= VELOCITY_WINDOW_FRAMES:
                 weight = 1.0 / sigma[near, marker, axis][measured]
                 inverse = np.linalg.pinv(weight[:, None] * powers[measured])
                 velocity[marker, axis] = inverse[1] @ (weight * position[near, marker, axis][measured])

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from rafl.capture.dataset.contradictions import contradictions
 from rafl.common.command_line import create_table
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
@@ -26,7 +27,10 @@ def recordings_table(dataset: Dataset) -> Table:
     for name, item in dataset.trajectories.items():
         values = item.attributes
         averaged = int(str(values.get("still_frames", 0)))
-        first_frame = f"{values.get('first_frame', '-')}" + (f" (mean of {averaged} before)" if averaged else "")
+        state = (
+            f" (mean of {averaged} before)" if averaged else " (moving)" if values.get("initial") == "moving" else ""
+        )
+        first_frame = f"{values.get('first_frame', '-')}{state}"
         table.add_row(
             name,
             item.split,
@@ -45,7 +49,7 @@ def _number(value: object, format_spec: str) -> str:
 
 
 def warnings(dataset: Dataset) -> list[str]:
-    """One message for each misplaced marker and each recording in which the registration left markers out."""
+    """Messages on misplaced markers, markers left out, frames that are not free, and quantities that contradict."""
     lines = []
     if hint := modulus_hint(dataset.simulator.material.youngs_modulus):
         lines.append(f"specimen {dataset.name}: {hint}")
@@ -67,7 +71,14 @@ def warnings(dataset: Dataset) -> list[str]:
                 f"recording {name}: {outliers} too far from the position in the specimen's layout, left out; correct "
                 "at_mm, or the names in the tracks"
             )
-    return lines
+        start, not_free = (int(str(item.attributes.get(key, 0))) for key in ("first_frame", "not_free_frames"))
+        if not_free:
+            lines.append(
+                f"recording {name}: expected a free motion from the release on, found none in frames "
+                f"{start - not_free} to {start - 1} (a hand, a slack string, or a load that touches again); it starts "
+                f"after them"
+            )
+    return lines + contradictions(dataset)
 
 
 def _frame_through_model(attributes: dict[str, Any]) -> str:

@@ -43,7 +43,7 @@ def test_detected_release_agrees_with_the_study(run: Run, tmp_path: Path) -> Non
     table = pd.read_csv(SPECIMENS / "clamped_beam_recordings.csv")
     table.drop(columns=["first_frame", "last_frame"]).to_csv(tmp_path / "recordings.csv", index=False)
     capture = ("rafl-capture", SPECIMENS / "clamped_beam.yaml", FOLDER, "--recordings", "recordings.csv")
-    assert run(*capture, "--out", "beam.h5", "--tolerance-mm", "8").returncode == 0
+    assert run(*capture, "--out", "beam.h5", "--tolerance-mm", "8", "--initial", "rest").returncode == 0
     trajectories = read_dataset(tmp_path / "beam.h5").trajectories
     for name, first in zip(table["recording"], table["first_frame"], strict=True):
         assert abs(int(str(trajectories[name].attributes["first_frame"])) - first) <= 2

@@ -188,8 +188,28 @@ def test_a_recording_that_starts_in_motion(small_specimen: Specimen, tmp_path: P
     velocity = (fine[61] - fine[59]) / 2e-3
     assert np.abs(item.q - fine[60]).max() < 1e-4
     assert np.linalg.norm(item.v - velocity) < 0.05 * np.linalg.norm(velocity)
-    at_rest = build(small_specimen, tmp_path, replace(SETTINGS, start=6)).trajectories["q0"]
+    at_rest = build(small_specimen, tmp_path, replace(SETTINGS, initial="rest", start=6)).trajectories["q0"]
     assert np.abs(at_rest.v).max() == 0.0
+
+
+def test_the_state_of_the_first_frame_is_found(small_specimen: Specimen, tmp_path: Path) -> None:
+    """The same motion from its release on, and from a frame on in which it is fast."""
+    fine = tip_load_release(small_specimen, small_specimen.material, 0.06, 400, 1000.0).q
+    markers = small_specimen.markers(1e-6).positions(torch.from_numpy(fine)).numpy()
+    for first, state in ((0, "rest"), (15, "moving")):
+        recorded = np.concatenate([small_specimen.layout.positions[None], markers[first::5]])
+        np.save(tmp_path / "q0.npy", 1e3 * recorded)
+        dataset = build(small_specimen, tmp_path, replace(SETTINGS, fps=200.0))
+        item = dataset.trajectories["q0"]
+        found = (item.attributes["initial"], item.attributes["first_frame"], item.attributes["not_free_frames"])
+        assert found == (state, 0, 0)
+        velocity = (fine[first + 1] - fine[max(first - 1, 0)]) / (1e-3 * (first + 1 - max(first - 1, 0)))
+        error = np.linalg.norm(item.v - (velocity if state == "moving" else 0.0))
+        assert error <= 0.1 * np.linalg.norm(velocity) * (state == "moving")
+        assert warnings(dataset) == []
+    slack = replace(item, attributes=item.attributes | {"first_frame": 16, "not_free_frames": 7})
+    (line,) = warnings(replace(dataset, trajectories={"q0": slack}))
+    assert "none in frames 9 to 15" in line
 
 
 def write_q0_tracks(specimen: Specimen, folder: Path, position: np.ndarray, sigma: np.ndarray) -> None:
