@@ -76,9 +76,11 @@ def _both(found: _Found, dataset: Dataset) -> str:
 
 def _swing(found: _Found, dataset: Dataset) -> str:
     assumed = dataset.simulator.material.youngs_modulus
+    hanging = dataset.trajectories[found.name].added_mass.any()
+    load = f" with {found.load:g} g hanging on it; correct load_g, " if hanging else "; correct "
     return (
         f"expected a Young's modulus of about {_kpa(assumed)} as in the specimen's description, found "
-        f"{_kpa(found.swing)} by the swing at {found.frequency:.3g} Hz; correct youngs_modulus, or "
+        f"{_kpa(found.swing)} by the swing at {found.frequency:.3g} Hz{load}youngs_modulus, or "
         f"{_wrong_rate(dataset, assumed / found.swing)}"
     )
 

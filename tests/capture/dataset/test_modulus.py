@@ -66,6 +66,18 @@ def test_a_recording_without_an_oscillation_has_no_swing(small_specimen: Specime
     assert np.isnan([found.swing, found.frequency, found.bend]).all()
 
 
+def test_a_hanging_load_that_no_specimen_holds_is_named(small_specimen: Specimen, released: Trajectory) -> None:
+    """60 kg instead of 60 g."""
+    mass = np.zeros(len(released.q))
+    mass[small_specimen.loaded] = 60.0 / len(small_specimen.loaded)
+    load = mass[:, None] * np.array([0.0, 0.0, -9.8])
+    item = replace(released, load=load, added_mass=mass)
+    swing = estimated(small_specimen, item, 0.0).swing
+    assert swing > 1e3 * TRUE_MODULUS
+    (line,) = messages(small_specimen, item, (float("nan"), swing), load_g=60000.0)
+    assert "with 60000 g hanging on it; correct load_g" in line
+
+
 def messages(specimen: Specimen, item: Trajectory, *moduli: tuple[float, float], load_g: float = 60.0) -> list[str]:
     """Contradictions of a dataset of recordings with moduli by bend and by swing [Pa]."""
     values = [{"bend_modulus": b, "swing_modulus": s, "swing_hz": 9.0, "load_g": load_g} for b, s in moduli]
