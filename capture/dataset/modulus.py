@@ -8,6 +8,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
+from rafl.common.errors import SimulationError
 from rafl.data.dataset import Trajectory
 from rafl.data.markers import Markers
 from rafl.data.synthetic import load_force
@@ -85,15 +86,12 @@ def estimate_modulus(
         item: the recording.
         loaded: nodes on which the load hung, (L).
         load: released from the specimen at rest [kg]; 0 if there was none.
-
-    Raises:
-        SimulationError: the specimen does not find its equilibrium under its own weight.
     """
     seen = item.valid.any(axis=0)
     swing = _Swing.of(item.time, item.markers[:, seen])
     tracked = markers.select(np.flatnonzero(seen))
     assumed = simulator.material.youngs_modulus
-    settled = simulator.equilibrium((simulator.weight + item.load)[None], label="settled shape")[0]
+    settled = _settled_shape(simulator, item)
     modulus = {"bend": np.nan, "swing": np.nan}
     if load > 0.0:
         force = load_force(simulator, loaded, load)
@@ -112,6 +110,15 @@ def estimate_modulus(
         own = float(squared[int(np.argmax(likeness))])
         modulus["swing"] = assumed * (2.0 * np.pi * swing.undamped_frequency) ** 2 / own
     return ModulusEstimates(modulus["bend"], modulus["swing"], swing.frequency)
+
+
+def _settled_shape(simulator: Simulator, item: Trajectory) -> Array:
+    """Equilibrium [m], (N, 3), under the weight and the hanging load; undeformed if they are too large for one."""
+    try:
+        shape: Array = simulator.equilibrium((simulator.weight + item.load)[None], label="settled shape")[0]
+    except SimulationError:
+        shape = simulator.mesh.vertices
+    return shape
 
 
 def _first_modes(simulator: Simulator, q: Array, mass: Array) -> tuple[Array, Array]:
