@@ -98,6 +98,8 @@ def run_trials(seeds: list[int], jobs: int, laboratory: Path, folder: Path) -> l
                 continue
             outcomes.append({"target": "?", "kind": "?", "code": None, "message": "", **found})
             outcomes[-1] |= {"seed": worker.seed, "seconds": seconds}
+            if found["wrong"]:
+                print(_description(outcomes[-1]), flush=True)
             alive = worker.process.is_alive() and "target" in found
             if not alive or worker.trials >= FRESH_WORKER or not waiting:
                 worker.end()
@@ -110,17 +112,18 @@ def run_trials(seeds: list[int], jobs: int, laboratory: Path, folder: Path) -> l
     return outcomes
 
 
+def _description(item: dict[str, object]) -> str:
+    return f"seed {item['seed']}, {item['target']}, {item['kind']}, {item['seconds']:.1f} s: {item['wrong']}\n"
+
+
 def print_counts(outcomes: list[dict[str, object]]) -> None:
-    """One line for each kind of file and exit code, then what was wrong."""
+    """One line for each kind of file and its exit codes, and one for the kinds of changes."""
     counts = Counter((str(item["target"]), str(item["code"])) for item in outcomes)
     for target in sorted({target for target, _ in counts}):
         codes = ", ".join(f"{count} x {code}" for (name, code), count in sorted(counts.items()) if name == target)
         print(f"{target:22} exit codes: {codes}")
     kinds = Counter(str(item["kind"]).rstrip(" 0123456789") for item in outcomes)
     print("changes:", ", ".join(f"{kind} {count}" for kind, count in sorted(kinds.items())))
-    for item in outcomes:
-        if item["wrong"]:
-            print(f"\nseed {item['seed']}, {item['target']}, {item['kind']}, {item['seconds']:.1f} s: {item['wrong']}")
 
 
 def main() -> None:
@@ -134,10 +137,13 @@ def main() -> None:
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        laboratory = prepare(folder)
-        outcomes = run_trials(
-            list(range(options.seed, options.seed + options.trials)), options.jobs, laboratory, folder
-        )
+        # In a process of its own: OpenMP ends workers that are forked from a process that has used it.
+        first = multiprocessing.Process(target=prepare, args=(folder,))
+        first.start()
+        first.join()
+        laboratory = folder / "laboratory"
+        seeds = list(range(options.seed, options.seed + options.trials))
+        outcomes = run_trials(seeds, options.jobs, laboratory, folder)
     if options.log:
         options.log.write_text("".join(json.dumps(item) + "\n" for item in outcomes))
     print_counts(outcomes)
