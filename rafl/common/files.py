@@ -181,7 +181,7 @@ def require_writable(path: Path) -> None:
     folder = next(part for part in (path.absolute(), *path.absolute().parents) if part.exists())
     if folder.is_file():
         if folder != path.absolute():
-            raise InputError(f"expected a folder at {folder}, found a file; write elsewhere, or move it away")
+            raise InputError(f"expected a folder at {folder}, found a file; check the path")
         folder = folder.parent
     try:
         with tempfile.TemporaryFile(dir=folder) as file:

@@ -231,7 +231,8 @@ def load_model(run: str | Path) -> FittedModel:
         raise InputError(f"expected identified values by name in {run / 'model.pt'}, found a list; fit again")
     integration = content.get(TIME_INTEGRATION_KEY)
     if integration is not None and not _is_time_integration(integration):
-        raise InputError(f"expected an integrator and substeps in {run / 'model.pt'}, found others; fit again")
+        found = integration.get("integrator") if isinstance(integration, dict) else integration
+        raise InputError(f"expected an integrator and substeps in {run / 'model.pt'}, found {found!s:.80}; fit again")
     with expect_content("a material", run / "model.pt"):
         values: dict[str, Any] = {key: tuple(x) if isinstance(x, list) else x for key, x in (material or {}).items()}
         Material(**values)

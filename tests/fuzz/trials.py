@@ -178,7 +178,7 @@ def trial(seed: int, laboratory: Path, folder: Path) -> Outcome:
                     kind = f"{kind} (not possible)"
                 before = contents(folder)
             code, stderr, through = run_line(line)
-        wrong = _wrong(code, stderr, through) or _wrong_files(before, contents(folder), code, line, work)
+        wrong = _wrong(code, stderr, through) or _wrong_files(before, contents(folder), code, line, work, kind)
     finally:
         os.chdir(before_folder)
         shutil.rmtree(folder)
@@ -199,14 +199,15 @@ def _wrong(code: int, stderr: str, through: BaseException | None) -> str:
     return f"expected a message, found {lines}" if code == 1 and not errors else ""
 
 
-def _wrong_files(before: Content, after: Content, code: int, line: tuple[str, ...], work: Path) -> str:
+def _wrong_files(before: Content, after: Content, code: int, line: tuple[str, ...], work: Path, kind: str) -> str:
     """What is wrong with the files after a command."""
     changed = sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
     hidden = [path for path in changed if Path(path).name.startswith(".")]
     outside = [path for path in changed if not path.startswith(("a/b/out", "a/b/new-run", "a/b/tracks", "a/b/run"))]
     if hidden or outside:
         return f"files that no one asked for: {hidden or outside}"
-    if code and changed and "--resume" not in line and "new-run" not in line and line[0] != "rafl-track":
+    whole = "--resume" in line or "new-run" in line or line[0] == "rafl-track" or kind == "fault: rename"
+    if code and changed and not whole:  # commands that write several files, of which some may be there already
         return f"exit code {code}, and files changed: {changed}"
     if code and any(path.startswith("a/b/new-run") for path in changed) and not any(p.endswith(".pt") for p in changed):
         return f"a run folder that the next start refuses: {changed}"

@@ -155,7 +155,7 @@ class _FileAttributes(pydantic.BaseModel):
     settings: str
     software: str
     notes: tuple[str, ...]
-    sources: tuple[Annotated[str, pydantic.Field(pattern="^[0-9a-f]{64}  ")], ...]
+    sources: tuple[Annotated[str, pydantic.Field(pattern="^[0-9a-f]+  ")], ...]
 
 
 def _read(file: h5py.File) -> Tracks:

@@ -101,7 +101,7 @@ def test_invalid_surfaces_are_refused(tmp_path: Path) -> None:
     two = trimesh.util.concatenate([box((20, 20, 20)), box((20, 20, 20), (60, 0, 0))])
     with pytest.raises(InputError, match="expected one body, found 2"):
         fill_surface(saved(tmp_path, two, "two.stl"), 0.01, "x-min")
-    with pytest.raises(InputError, match="is the file in mm"):
+    with pytest.raises(InputError, match="are all lengths in mm"):
         fill_surface(saved(tmp_path, box((3000, 3000, 3000)), "huge.stl"), 0.01, "x-min")
     (tmp_path / "bad.stl").write_bytes(b"solid nothing\nendsolid")
     (tmp_path / "bad.obj").write_bytes(bytes(range(256)))
