@@ -8,7 +8,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install demo test test-slow fuzz lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
-	bench-simulator bench-tracking bench-paper bench-capture bench-sim2real bench-labs bench-laws bench-mesh laws clean
+	bench-simulator bench-tracking bench-paper bench-capture bench-places bench-sim2real bench-labs bench-laws bench-mesh laws clean
 
 install: $(VENV)/installed $(VENV)/kernels
 
@@ -126,6 +126,10 @@ bench-mesh: install
 # The direct fit of the first frame compared with the sequence of forces of earlier work.
 bench-capture: install
 	$(BIN)/python tests/bench/first_frame.py
+
+# A specimen whose dots are off their described places: are the places found, and E?
+bench-places: install
+	$(BIN)/python tests/bench/places.py
 
 clean:
 	rm -rf build $(VENV)
