@@ -1,5 +1,6 @@
 """Assigning marker names to the dots of a first frame, by the specimen's layout or by row and column."""
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -174,6 +175,22 @@ def name_by_rows(dots: Array, late_count: int = 0) -> list[str]:
         names = name_by_rows(dots[:-late_count])
         last = max(int(name[1:].split("c")[0]) for name in names)
         return names + [f"r{last + 1}c{column + 1}" for column in range(late_count)]
+    return [f"r{row + 1}c{column + 1}" for row, column in rows_and_columns(dots)]
+
+
+def is_row_name(name: str) -> bool:
+    """Whether a marker's name is one of row and column, perhaps after a camera's: r1c2, left-r1c2."""
+    return re.fullmatch(r"(.+-)?r\d+c\d+", name) is not None
+
+
+def rows_and_columns(dots: Array) -> NDArray[np.int64]:
+    """Row and column, from 0, of dots (D, 2), whose first coordinate grows along rows and the second from row to row.
+
+    Dots that form no grid, which may be bent, are ordered by the second coordinate, then by the first.
+    """
+    if len(dots) == 1:
+        return np.zeros((1, 2), dtype=np.int64)
+    indices = _grid_indices(dots)
     if indices is None:
         spacing = float(np.median(cKDTree(dots).query(dots, 2)[0][:, 1]))
         order = np.argsort(dots[:, 1])
@@ -183,7 +200,7 @@ def name_by_rows(dots: Array, late_count: int = 0) -> list[str]:
         for members in (np.flatnonzero(row == number) for number in range(row.max() + 1)):
             column[members[np.argsort(dots[members, 0])]] = np.arange(len(members))
         indices = np.stack([row, column], axis=1)
-    return [f"r{row + 1}c{column + 1}" for row, column in indices]
+    return indices
 
 
 def _grid_indices(dots: Array) -> NDArray[np.int64] | None:
