@@ -1,4 +1,4 @@
-"""The commands `rafl-render` and `rafl-capture`: their options, and the checks that need no heavy import."""
+"""The commands `rafl-render`, `rafl-specimen` and `rafl-capture`: options, and checks that need no heavy import."""
 
 import re
 from enum import StrEnum
@@ -14,6 +14,7 @@ from rafl.common.files import require_file
 SPECIMEN = "a specimen description (specimen.yaml)"
 
 render_app = create_app("Render videos of simulated specimens.")
+specimen_app = create_app("Describe specimens.")
 capture_app = create_app("Build datasets.")
 
 
@@ -30,6 +31,14 @@ class Codec(StrEnum):
     h264 = "h264"
     ffv1 = "ffv1"
     mjpeg = "mjpeg"
+
+
+class Unit(StrEnum):
+    """Unit of positions."""
+
+    m = "m"
+    cm = "cm"
+    mm = "mm"
 
 
 @render_app.command()
@@ -96,12 +105,92 @@ class Forces(StrEnum):
     surface = "surface"
 
 
-class Unit(StrEnum):
-    """Unit of positions."""
+@specimen_app.command()
+@report_errors
+def specimen(
+    still: Annotated[
+        Path | None,
+        typer.Argument(help="Tracks (.h5), motion capture (.c3d, .trc, .tsv, .csv) or points of the specimen at rest."),
+    ] = None,
+    box: Annotated[str, typer.Option(help="Size of a box along x, y and z [mm], for instance 100x30x30.")] = "",
+    surface: Annotated[
+        Path | None, typer.Option(help="Instead: closed surface (.stl, .obj, .ply) in mm, in the specimen frame.")
+    ] = None,
+    like: Annotated[
+        Path | None,
+        typer.Option(help="Instead: a specimen.yaml whose body and material are taken, without its markers."),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="File to write [specimen.yaml; with --stencil, stencil.pdf].")
+    ] = None,
+    youngs_modulus: Annotated[
+        float | None,
+        typer.Option(min=1.0, help="Young's modulus [Pa], if measured to about 10 % [assumed]."),
+    ] = None,
+    lying: Annotated[
+        bool, typer.Option("--lying", help="The specimen lies flat, so that gravity does not bend it.")
+    ] = False,
+    element_mm: Annotated[
+        float | None, typer.Option(min=0.01, help="Edge of the elements [mm] [10, or less for a thin body].")
+    ] = None,
+    unit: Annotated[Unit | None, typer.Option(help="Unit of positions in a table that does not name it.")] = None,
+    stencil: Annotated[
+        bool, typer.Option("--stencil", help="Instead: draw a layout of dots for a box, to print and cut (PDF).")
+    ] = False,
+    dot_mm: Annotated[float, typer.Option(min=0.1, help="With --stencil: diameter of the dots [mm].")] = 3.0,
+) -> None:
+    """Describe a specimen from a recording of it at rest: name its dots and find their places on the undeformed body.
 
-    m = "m"
-    cm = "cm"
-    mm = "mm"
+    Writes specimen.yaml and a picture beside it. Nothing but its own weight may bend the specimen.
+
+    Example: rafl-specimen tracks/still.h5 --box 100x30x30 --out specimen.yaml
+
+    Example before there is a specimen: rafl-specimen --stencil --box 100x30x30 --out stencil.pdf
+    """
+    if sum((bool(box), surface is not None, like is not None)) != 1:
+        raise InputError("expected one of --box, --surface and --like, which describe the body; give one of them")
+    if stencil == (still is not None):
+        raise InputError("expected a recording of the specimen at rest, or --stencil; give one of them")
+    size = _box(box) if box else None
+    out = out or Path("stencil.pdf" if stencil else "specimen.yaml")
+    suffixes = (".pdf",) if stencil else (".yaml", ".yml")
+    if out.suffix.lower() not in suffixes:
+        raise InputError(f"--out: expected a file that ends with {' or '.join(suffixes)}, found {out}")
+    for path in (out, out.with_suffix(".yaml" if stencil else ".png")):
+        if path.exists():
+            raise InputError(f"expected no file yet at {path}, found one; choose another --out")
+    if stencil:
+        if size is None:
+            raise InputError("--stencil: expected --box, found another body; draw its dots in the program of its shape")
+        from rafl.capture import commands
+
+        commands.stencil(size, dot_mm, out)
+        return
+    assert still is not None
+    require_file(still, "a recording of the specimen at rest (.h5, .c3d, .csv, .trc, .tsv, .npy)")
+    if surface is not None:
+        require_file(surface, "a surface (.stl, .obj or .ply)")
+    if like is not None:
+        require_file(like, SPECIMEN)
+        if element_mm is not None:
+            raise InputError(
+                "--element-mm: expected --box or --surface, found --like, which has elements; leave it out"
+            )
+    from rafl.capture import commands
+
+    body = commands.SpecimenBody(size, surface, like, element_mm, youngs_modulus)
+    commands.describe_specimen(still, body, lying, unit and unit.value, out)
+
+
+def _box(text: str) -> tuple[float, float, float]:
+    """The sides of `--box` [mm]."""
+    try:
+        x, y, z = (float(part) for part in text.lower().split("x"))
+    except ValueError:
+        raise InputError(f"--box: expected three lengths in mm such as 100x30x30, found {text!r}") from None
+    if not all(0.0 < side < float("inf") for side in (x, y, z)):
+        raise InputError(f"--box: expected lengths above 0 mm, found {text!r}")
+    return x, y, z
 
 
 @capture_app.command()

@@ -1,5 +1,6 @@
-"""What `rafl-render` and `rafl-capture` do once their options are checked: call the library, print and write."""
+"""What `rafl-render`, `rafl-specimen` and `rafl-capture` do once their options are checked: call, print and write."""
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,14 +12,20 @@ from rich.console import Console
 from rafl.capture.dataset.build import CaptureSettings as CaptureSettings
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.naming import read_marker_names as read_marker_names
+from rafl.capture.dataset.sources import read_recording
 from rafl.capture.dataset.summary import print_contents, recordings_table, warnings
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
+from rafl.capture.description.describe import Description, describe
+from rafl.capture.description.drawing import write_drawing
+from rafl.capture.description.specimen_text import body_like, body_of_box, body_of_surface, specimen_text
+from rafl.capture.description.stencil import design_stencil, write_stencil
+from rafl.capture.registration.places import MODULUS_SIGMA
 from rafl.capture.registration.registration import RestPose as RestPose
 from rafl.capture.rendering.film import ENCODINGS, render_video, side_cameras, write_board_images, write_truth
 from rafl.capture.rendering.motion import SimulatedMotion, tip_load_release, twist_release
 from rafl.capture.rendering.render import Appearance, Renderer
 from rafl.capture.report import write_dataset_report
-from rafl.capture.specimen.specimen import Specimen, read_specimen
+from rafl.capture.specimen.specimen import Body, Specimen, read_specimen
 from rafl.common.command_line import progress
 from rafl.common.errors import InputError, SimulationError
 from rafl.common.files import write_text
@@ -27,6 +34,9 @@ from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
 from rafl.data.markers import Markers
 
+UNUSED_FPS = 100.0  # of a recording at rest without times
+MEASURED_SIGMA = 0.1  # standard deviation of log E that a user gives: tensile tests of soft rubber differ by so much
+UNCERTAIN_MM = 1.0  # a larger standard deviation of a place is worth a note [mm]: rulers are better
 DRAWN_MM = 2.0  # largest distance from the skin of the mesh at which a marker is drawn [mm]
 
 
@@ -102,6 +112,121 @@ def _recordings_csv(motions: list[SimulatedMotion]) -> str:
     pattern = ("train", "test", "train", "val", "train", "test")
     rows = [f"{m.name},{1e3 * m.load:g},{pattern[i % len(pattern)]}" for i, m in enumerate(motions)]
     return "\n".join(["recording,load_g,split", *rows, ""])
+
+
+@dataclass(frozen=True)
+class SpecimenBody:
+    """The body of a specimen, as the options of `rafl-specimen` describe it.
+
+    Attributes:
+        size_mm, surface, like: of a box, a surface, or another specimen file; one of them is not None.
+        element_mm: edge of the elements; None to choose it.
+        youngs_modulus: measured [Pa]; None for that of the material.
+    """
+
+    size_mm: tuple[float, float, float] | None
+    surface: Path | None
+    like: Path | None
+    element_mm: float | None
+    youngs_modulus: float | None
+
+    def read(self, name: str, folder: Path) -> Body:
+        """The description of a specimen of this name, for a file in `folder`."""
+        if self.like is not None:
+            body = body_like(name, self.like, folder)
+        elif self.surface is not None:
+            body = body_of_surface(name, self.surface, self.element_mm, folder)
+        else:
+            assert self.size_mm is not None
+            body = body_of_box(name, self.size_mm, self.element_mm)
+        return body if self.youngs_modulus is None else body.with_modulus(self.youngs_modulus)
+
+
+def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str | None, out: Path) -> None:
+    """Describe a specimen from a recording of it at rest; write specimen.yaml and a picture.
+
+    Args:
+        still: the recording.
+        given: the body.
+        lying: whether the specimen lies flat.
+        unit: of positions in a table that does not name it.
+        out: specimen.yaml to write.
+
+    Raises:
+        InputError: a file cannot be read, or the dots are not on the body.
+    """
+    torch.set_num_threads(1)
+    announce_compilation()
+    body = given.read(_specimen_name(out), out.parent)
+    recording = read_recording(still, UNUSED_FPS, unit)
+    try:
+        sigma = MODULUS_SIGMA if given.youngs_modulus is None else MEASURED_SIGMA
+        found = describe(recording, body, out.parent, lying, str(still), sigma)
+    except SimulationError as error:
+        raise InputError(f"the body cannot bear its own weight: {error}; check its size and --youngs-modulus") from None
+    places, sigmas = 1e3 * found.undeformed.carried.rest + 0.0, 1e3 * found.undeformed.sigma
+    markers: list[dict[str, object]] = [
+        {
+            "name": found.names[k],
+            "at_mm": [round(float(x), 2) for x in places[k]],
+            "at_sigma_mm": round(float(sigmas[k]), 2),
+        }
+        for k in found.listed
+    ]
+    remarks = {
+        "": f"Described from {still.name} by rafl-specimen. Look at {out.with_suffix('.png').name}.",
+        "material": f"To check: density and Poisson's ratio are assumed. Young's modulus {_modulus_text(found)}.",
+        "clamp": "To check: the face that is held, and the face on which loads hang.",
+        "markers": "Places on the undeformed body. A place that you measured better replaces the one found here.",
+    }
+    write_drawing(out.with_suffix(".png"), found, f"{body.name}, from {still.name}")
+    write_text(out, specimen_text(body.with_modulus(found.youngs_modulus), markers, remarks))
+    for name, distance in found.left_out.items():
+        typer.echo(
+            f"warning: dot {name} lies {1e3 * distance:.1f} mm off every face and was left out; if it is on the "
+            "specimen, the size of the body is wrong",
+            err=True,
+        )
+    typer.echo(f"{len(markers)} dots, places to {sigmas.max():.2f} mm; Young's modulus {_modulus_text(found)}")
+    if not lying and sigmas.max() > UNCERTAIN_MM:
+        typer.echo(
+            "note: the dots do not tell well how far the specimen sags; lay it flat (--lying), or measure its Young's "
+            "modulus (--youngs-modulus)"
+        )
+    typer.echo(f"wrote {out} and {out.with_suffix('.png')}")
+    typer.echo(f"next: rafl-track videos/ --calib calib.yaml --specimen {out}")
+
+
+def _modulus_text(found: Description) -> str:
+    modulus, sigma = 1e-3 * found.youngs_modulus, 100.0 * found.undeformed.modulus_sigma
+    return f"{modulus:.3g} kPa +- {sigma:.0f} %, {'from the sag' if found.sag_tells else 'assumed'}"
+
+
+def stencil(size_mm: tuple[float, float, float], dot_mm: float, out: Path) -> None:
+    """Draw a layout of dots for a box to scale (PDF), and write the specimen file that fits it.
+
+    Raises:
+        InputError: the box is too small for dots of this diameter [mm].
+    """
+    layout = design_stencil(size_mm, dot_mm)
+    description = out.with_suffix(".yaml")
+    body = body_of_box(_specimen_name(out), size_mm, None)
+    remarks = {
+        "": f"Dots of {out.name}, drawn by rafl-specimen.",
+        "material": "To check: all of it is assumed.",
+        "clamp": "To check: the face that is held, and the face on which loads hang.",
+    }
+    write_stencil(out, layout)
+    entries = [item.model_dump(exclude_unset=True, mode="json") for item in layout.markers]
+    write_text(description, specimen_text(body, entries, remarks))
+    count = sum(len(item.markers()) for item in layout.markers)
+    typer.echo(f"wrote {out} ({count} dots of {dot_mm:g} mm) and {description}")
+    typer.echo("next: print at 100 %, measure the scale bar, put the dots on the specimen, and film it")
+
+
+def _specimen_name(path: Path) -> str:
+    """The name of a specimen whose file has this path."""
+    return re.sub(r"[^\w.-]", "-", path.stem)
 
 
 def capture(

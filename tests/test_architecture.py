@@ -22,7 +22,7 @@ INSIDE = {
         "detection",
         "reconstruction",
     ],
-    "capture": ["cli", "commands", "report", "rendering", "dataset", "registration", "specimen"],
+    "capture": ["cli", "commands", "report", "rendering|description", "dataset", "registration", "specimen"],
 }
 FOLDERS = {"rafl": "rafl", "tracking": "rafl.tracking", "capture": "rafl.capture", "calibration": "rafl.calibration"}
 MOST_MODULES = 14

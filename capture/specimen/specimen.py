@@ -98,7 +98,9 @@ class _Load(StrictModel):
     face: Face
 
 
-class _SpecimenFile(StrictModel):
+class Body(StrictModel):
+    """All of a specimen file but its markers."""
+
     format: str
     name: str = Field(pattern=r"^[\w.-]+$")
     geometry: Geometry
@@ -106,6 +108,16 @@ class _SpecimenFile(StrictModel):
     clamp: _Clamp
     load: _Load = _Load(face="x-max")
     simulation: _Simulation = _Simulation()
+
+    def with_modulus(self, youngs_modulus: float) -> "Body":
+        """The body with another Young's modulus [Pa], to four digits."""
+        material = self.material.model_copy(update={"youngs_modulus": float(f"{youngs_modulus:.4g}")})
+        return self.model_copy(update={"material": material})
+
+
+class SpecimenFile(Body):
+    """The content of a specimen file."""
+
     markers: Annotated[MarkerList, Field(min_length=1)]
 
 
@@ -178,8 +190,33 @@ def read_specimen(path: str | Path) -> Specimen:
         InputError: the file is missing, damaged or of a newer version, or the shape cannot be meshed.
     """
     path = Path(path)
-    content = read_yaml(path, _SpecimenFile, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
-    solid = content.geometry.build_solid(path.parent, content.clamp.face)
+    content = read_specimen_file(path)
+    layout = MarkerLayout.of(content.markers)
+    return build_specimen(content, layout, path.parent, path.read_text(encoding="utf-8"))
+
+
+def read_specimen_file(path: Path) -> SpecimenFile:
+    """Read the content of `specimen.yaml` without meshing it.
+
+    Raises:
+        InputError: the file is missing, damaged or of a newer version.
+    """
+    return read_yaml(path, SpecimenFile, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
+
+
+def build_specimen(content: Body, layout: MarkerLayout, folder: Path, text: str) -> Specimen:
+    """Mesh a described body and take its markers from a layout.
+
+    Args:
+        content: of the description.
+        layout: of the markers; may be empty.
+        folder: that the file of a surface is relative to.
+        text: of the description.
+
+    Raises:
+        InputError: the shape cannot be meshed.
+    """
+    solid = content.geometry.build_solid(folder, content.clamp.face)
     material, mesh = content.material.material(), solid.mesh
     split = content.clamp.split
     if split is None:
@@ -193,9 +230,9 @@ def read_specimen(path: str | Path) -> Specimen:
         material,
         mesh.face_nodes(content.clamp.face),
         mesh.face_nodes(content.load.face),
-        MarkerLayout.of(content.markers),
+        layout,
         MarkerLayout.of(content.clamp.markers),
-        path.read_text(encoding="utf-8"),
+        text,
         content.simulation.integrator or integrator,
         content.simulation.substeps or substeps,
         solid.volume,
