@@ -9,6 +9,7 @@ import cv2
 import h5py
 import numpy as np
 import pytest
+from stills import SIDES, still
 from support import Run, assert_refused, draw_frame
 
 from rafl.calibration.camera import OrthographicCamera, Plane
@@ -16,7 +17,8 @@ from rafl.calibration.rig import Rig, write_calibration
 from rafl.capture.dataset.build import CaptureSettings, build_dataset
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.rendering.motion import tip_load_release
-from rafl.capture.specimen.specimen import Specimen
+from rafl.capture.specimen.specimen import Specimen, read_specimen
+from rafl.common.marker_table import marker_table
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import write_dataset
 from rafl.data.synthetic import release_dataset
@@ -89,6 +91,60 @@ def test_track_refuses_wrong_input(videos: Path, run: Run, tmp_path: Path) -> No
     refused("other.yaml", calib="other.yaml")
     refused("--fps", more=("--fill", "3"))
     refused("--export", "'xlsx'", more=("--fps", "50", "--export", "csv,xlsx"))
+
+
+def write_still(path: Path, size_factor: float = 1.0) -> None:
+    """A CSV file of `rafl-track` that shows a box at rest, with dots on its sides."""
+    recording = still(SIDES)
+    assert recording.names is not None
+    table = marker_table(recording.time, recording.names, size_factor * recording.position)
+    for axis, sigma in zip("xyz", np.moveaxis(1e3 * recording.sigma, -1, 0), strict=True):
+        table[f"sigma_{axis}_mm"] = sigma.ravel()
+    table.to_csv(path, index=False)
+
+
+def test_a_still_gives_a_specimen_that_reads_back(run: Run, tmp_path: Path) -> None:
+    write_still(tmp_path / "still.csv")
+    result = run("rafl-specimen", "still.csv", "--box", "100x20x20", "--out", "beam.yaml")
+    assert result.returncode == 0, result.stderr
+    assert "32 dots" in result.stdout
+    assert "next: rafl-track videos/ --calib calib.yaml --specimen beam.yaml" in result.stdout
+    specimen = read_specimen(tmp_path / "beam.yaml")
+    assert specimen.name == "beam"
+    assert specimen.layout.names[:2] == ("L1", "L2")
+    np.testing.assert_allclose(specimen.layout.positions, 1e-3 * SIDES, atol=0.3e-3)
+    assert 0.04e-3 < specimen.layout.sigma.min() < specimen.layout.sigma.max() < 1.5e-3
+    assert (tmp_path / "beam.png").stat().st_size > 10_000
+    again = run("rafl-specimen", "still.csv", "--box", "100x20x20", "--out", "beam.yaml")
+    assert_refused(again, "beam.yaml", "choose another --out")
+
+
+def test_specimen_refuses_wrong_input(run: Run, tmp_path: Path) -> None:
+    write_still(tmp_path / "still.csv")
+    write_still(tmp_path / "large.csv", 2.0)
+    (tmp_path / "bad.h5").write_text("not tracks")
+    before = folder_content(tmp_path)
+    for parts, arguments in (
+        (("--box", "--surface", "--like"), ["still.csv"]),
+        (("--box", "'100x20'"), ["still.csv", "--box", "100x20"]),
+        (("--box", "above 0"), ["still.csv", "--box", "100x20x0"]),
+        (("--stencil",), ["--box", "100x20x20"]),
+        (("bad.h5",), ["bad.h5", "--box", "100x20x20"]),
+        (("large.csv", "correct the size"), ["large.csv", "--box", "100x20x20"]),
+        (("--element-mm", "thin"), ["still.csv", "--box", "100x0.5x20"]),
+        ((".yaml", "out.csv"), ["still.csv", "--box", "100x20x20", "--out", "out.csv"]),
+        (("--dot-mm",), ["--stencil", "--box", "10x5x5"]),
+    ):
+        assert_refused(run("rafl-specimen", *arguments), *parts)
+        assert folder_content(tmp_path) == before
+
+
+def test_a_stencil_comes_with_its_specimen(run: Run, tmp_path: Path) -> None:
+    result = run("rafl-specimen", "--stencil", "--box", "100x30x30", "--out", "dots.pdf")
+    assert result.returncode == 0, result.stderr
+    specimen = read_specimen(tmp_path / "dots.yaml")
+    assert len(specimen.layout.names) == 50
+    assert (tmp_path / "dots.pdf").read_bytes().startswith(b"%PDF")
 
 
 def test_damaged_image_is_reported_and_its_markers_are_missing(videos: Path, run: Run, tmp_path: Path) -> None:

@@ -148,7 +148,8 @@ def track(
 ) -> None:
     """Track the markers of every recording: find, follow and name them, and reconstruct their 3-D positions.
 
-    A recording is not tracked again if its videos, calibration and settings are unchanged.
+    A recording is not tracked again if its videos, calibration and settings are unchanged. Without --specimen, the
+    tracks of a recording at rest are what `rafl-specimen` describes the specimen from.
 
     Example: rafl-track videos/ --calib calib.yaml --specimen specimen.yaml
     """

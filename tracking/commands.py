@@ -299,7 +299,7 @@ def track(
         first = next(iter(failed))
         raise InputError(f"recording {first}: {failed[first]}")
     write_report(out / "report.html", done, rig)
-    _print_results(out, done, failed, len(kept))
+    _print_results(out, done, failed, len(kept), layout is not None)
     if failed:
         raise typer.Exit(1)
 
@@ -324,7 +324,7 @@ def _announce_filmed(calib: Path, videos: Path, count: int) -> dict[str, tuple[i
     return filmed
 
 
-def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int) -> None:
+def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int, named: bool) -> None:
     Console(width=110).print(_summary_table(done))
     for name, tracks in done.items():
         for note in tracks.notes:
@@ -334,7 +334,10 @@ def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], k
     if kept:
         typer.echo(f"kept the tracks of {kept} recordings: nothing changed since they were tracked")
     typer.echo(f"wrote {len(done) - kept} tracks files to {out}/; look at {out}/report.html")
-    typer.echo(f"next: rafl-capture specimen.yaml {out} --recordings recordings.csv")
+    if named:
+        typer.echo(f"next: rafl-capture specimen.yaml {out} --recordings recordings.csv")
+    else:
+        typer.echo(f"next: rafl-specimen {out}/STILL.h5 --box 100x30x30, with the recording at rest and the size in mm")
 
 
 @contextmanager

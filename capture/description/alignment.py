@@ -13,8 +13,10 @@ from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 Array = NDArray[Any]
 
 MAX_STEPS = 50
-STEP_TOLERANCE = 1e-6  # [m]
-MIN_SINGULAR_VALUE = 1e-3  # relative to the largest: motions that the dots tell less of are left out
+STEP_TOLERANCE = 1e-5  # [m]; the alignment ends with smaller steps
+# Singular values, relative to the largest, of motions that are left out: of those that the dots do not tell, and of
+# those too that they tell only through the slight curvature of faces under load.
+UNTOLD, HARDLY_TOLD = 1e-3, 2e-2
 FACE_SIGMA = 1e-4  # of a face from where the size of the body says it is, at least [m]
 # Rotations from the frame of a recording to one with z up: motion capture has z up, or y.
 UPRIGHT = (np.eye(3), np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]))
@@ -35,7 +37,9 @@ class Alignment:
     sigma: Array
 
 
-def align_with_surface(shape: Shape, q: Array, dots: Dots, start: RigidTransform = IDENTITY) -> Alignment:
+def align_with_surface(
+    shape: Shape, q: Array, dots: Dots, start: RigidTransform = IDENTITY, least: float = UNTOLD
+) -> Alignment:
     """The transform near `start` that puts the dots on the body, with point-to-plane steps (Chen and Medioni, 1992).
 
     Motions along all faces that hold dots are left at zero, and their standard deviation is infinite.
@@ -45,6 +49,7 @@ def align_with_surface(shape: Shape, q: Array, dots: Dots, start: RigidTransform
         q: its nodes as it is deformed [m], (N, 3).
         dots: to be moved.
         start: first guess.
+        least: singular value, relative to the largest, of the motions that are allowed.
     """
     pose, length = start, float(np.ptp(shape.mesh.vertices, axis=0).max())
     for _ in range(MAX_STEPS):
@@ -52,7 +57,7 @@ def align_with_surface(shape: Shape, q: Array, dots: Dots, start: RigidTransform
         gap, towards = _gaps(shape, q, replace(dots, position=moved))
         arm = (moved - moved.mean(axis=0)) / length
         jacobian = np.column_stack([np.cross(arm, towards), towards])
-        step = np.linalg.lstsq(jacobian, -gap, rcond=MIN_SINGULAR_VALUE)[0]
+        step = np.linalg.lstsq(jacobian, -gap, rcond=least)[0]
         centred = RigidTransform(pose.rotation, pose.translation - moved.mean(axis=0))
         turned = centred.followed_by(np.concatenate([step[:3] / length, step[3:]]))
         pose = RigidTransform(turned.rotation, turned.translation + moved.mean(axis=0))
@@ -60,7 +65,7 @@ def align_with_surface(shape: Shape, q: Array, dots: Dots, start: RigidTransform
             break
     distance = float(np.sqrt(np.mean(_gaps(shape, q, replace(dots, position=pose.apply(dots.position)))[0] ** 2)))
     _, values, motions = np.linalg.svd(jacobian)
-    values = np.where(values > MIN_SINGULAR_VALUE * values[0], values, 0.0)
+    values = np.where(values > least * values[0], values, 0.0)
     motion = np.cross(motions[:, None, :3], arm) + motions[:, None, 3:]  # of each dot, (6, M, 3)
     with np.errstate(divide="ignore"):
         spread = max(distance, FACE_SIGMA) / values

@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rafl.capture.description.alignment import Alignment, align_with_surface, find_pose
+from rafl.capture.description.alignment import HARDLY_TOLD, Alignment, align_with_surface, find_pose
 from rafl.capture.description.naming import dots_by_row, faces_of, name_dots
 from rafl.capture.description.still import Dots, dots_at_rest
 from rafl.capture.description.undeformed import PLACED_SIGMA, Shape, Undeformed, carry_back, find_undeformed
 from rafl.capture.registration.places import MODULUS_SIGMA
 from rafl.capture.registration.recording import Recording
-from rafl.capture.registration.rigid import MARKERS_PER_OUTLIER, MIN_MARKERS
+from rafl.capture.registration.rigid import MARKERS_PER_OUTLIER, MIN_MARKERS, RigidTransform
 from rafl.capture.specimen.geometry import read_surface
 from rafl.capture.specimen.specimen import Body, build_specimen
 from rafl.common.errors import InputError
@@ -24,6 +24,7 @@ Array = NDArray[Any]
 
 MAX_POSE_SIGMA = 1e-3  # largest standard deviation of a dot's place that an unknown frame may leave [m]
 UNKNOWN_POSE_SIGMA = 1e-2  # of the height and tilt of a body whose frame is found with E in turn [m]
+MAX_MODULUS_SIGMAS = 3.0  # E farther off the assumed one contradicts it [standard deviations of log E]
 POSE_ITERATIONS = 3  # of the frame and E in turn
 MAX_DISTANCE = 3e-3  # of a dot from every face [m]: half a millimetre of the hand, and a body cast not quite to size
 
@@ -90,15 +91,13 @@ def describe(
     dots = dots.select(np.array([name not in specimen.clamp_layout.names for name in dots.names]))
     left_out: dict[str, float] = {}
     q = simulator.equilibrium(simulator.weight[None], label=f"{label}: the specimen under its own weight")[0]
-    excess = _excess(shape, q, dots, modulus_sigma)
-    placed = recording.in_specimen_frame or float(np.median(excess)) < MAX_DISTANCE
+    placed = recording.in_specimen_frame or _fits(shape, q, dots, modulus_sigma)
     if not placed:
         alignment = find_pose(shape, q, dots)
         dots = replace(dots, position=alignment.pose.apply(dots.position))
-        excess = _excess(shape, q, dots, modulus_sigma)
-        if float(np.median(excess)) < MAX_DISTANCE:
+        if _fits(shape, q, dots, modulus_sigma):
             _check_pose(alignment, faces_of(carry_back(shape, q, dots).normal), label)
-    dots = _dots_on_body(shape, q, dots, excess, left_out, label)
+    dots = _dots_on_body(shape, q, dots, left_out, label, modulus_sigma)
     undeformed = find_undeformed(shape, simulator, dots, modulus_sigma, PLACED_SIGMA if placed else UNKNOWN_POSE_SIGMA)
     if not placed:
         for _ in range(POSE_ITERATIONS):
@@ -106,7 +105,7 @@ def describe(
             dots = replace(dots, position=alignment.pose.apply(dots.position))
             undeformed = find_undeformed(shape, simulator, dots, modulus_sigma, UNKNOWN_POSE_SIGMA)
         undeformed = replace(undeformed, sigma=np.hypot(undeformed.sigma, alignment.sigma))
-    kept = _dots_on_body(shape, undeformed.q, dots, undeformed.carried.distance, left_out, label)
+    kept = _dots_on_body(shape, undeformed.q, dots, left_out, label)
     if len(kept.names) < len(dots.names):
         dots, undeformed = kept, find_undeformed(shape, simulator, kept, modulus_sigma)
     faces, rest = faces_of(undeformed.carried.normal), undeformed.carried.rest
@@ -116,34 +115,50 @@ def describe(
     elif all(is_row_name(name) for name in names):
         names, listed = name_dots(faces, rest), np.concatenate(dots_by_row(faces, rest))
     modulus = specimen.material.youngs_modulus * float(np.exp(undeformed.log_modulus))
+    if abs(undeformed.log_modulus) > MAX_MODULUS_SIGMAS * modulus_sigma:
+        assumed = specimen.material.youngs_modulus
+        raise InputError(
+            f"{label}: expected a sag of the assumed material, {1e-3 * assumed:.3g} kPa, found that of one near "
+            f"{1e-3 * modulus:.3g} kPa; correct the size of the body or --youngs-modulus, or say that it lies flat "
+            "(--lying)"
+        )
     return Description(shape, dots, names, listed, undeformed, modulus, left_out, modulus_sigma)
 
 
-def _excess(shape: Shape, q: Array, dots: Dots, modulus_sigma: float) -> Array:
-    """Distances of dots from the body beyond what its sag may be off, by the uncertain E [m], (M)."""
+def _distances(shape: Shape, q: Array, dots: Dots, modulus_sigma: float) -> tuple[Array, Array]:
+    """Distances of dots from the body, and the largest allowed ones, as an uncertain E bends it otherwise [m], (M)."""
     carried = carry_back(shape, q, dots)
     sag = np.linalg.norm(dots.position - carried.gap - carried.rest, axis=1)
-    return np.asarray(carried.distance - modulus_sigma * sag)
+    return carried.distance, MAX_DISTANCE + modulus_sigma * sag
+
+
+def _fits(shape: Shape, q: Array, dots: Dots, modulus_sigma: float) -> bool:
+    """Whether most dots lie on the body."""
+    distance, allowed = _distances(shape, q, dots, modulus_sigma)
+    return bool(np.median(distance - allowed) < 0.0)
 
 
 def _check_pose(alignment: Alignment, faces: list[str], label: str) -> None:
     """Raise InputError if the dots do not tell where the body is."""
     if alignment.sigma.max() > MAX_POSE_SIGMA:
+        held = ", ".join(sorted(set(faces)))
         raise InputError(
             f"{label}: expected a recording in the specimen's frame, or dots that tell where the body is, found "
-            f"another frame and dots on {', '.join(sorted(set(faces)))} only; put dots on the tip and the "
-            "top too, or set the origin of the motion capture at the lower corner of the clamped face (x from clamp to tip, y across, z up)"
+            f"another frame and dots on {held} only; put dots on the tip and the top too, or set the origin of motion "
+            "capture at the lower corner of the clamped face (x from clamp to tip, y across, z up)"
         )
 
 
-def _dots_on_body(shape: Shape, q: Array, dots: Dots, distance: Array, left_out: dict[str, float], label: str) -> Dots:
+def _dots_on_body(
+    shape: Shape, q: Array, dots: Dots, left_out: dict[str, float], label: str, modulus_sigma: float = 0.0
+) -> Dots:
     """The dots that lie on the body; enters the others, if they are few, into `left_out`.
 
     Raises:
         InputError: many dots are far from the body.
     """
-    far = distance > MAX_DISTANCE
-    total = len(dots.names) + len(left_out)
+    distance, allowed = _distances(shape, q, dots, modulus_sigma)
+    far, total = distance > allowed, len(dots.names) + len(left_out)
     if far.sum() + len(left_out) > max(1, total // MARKERS_PER_OUTLIER) or (~far).sum() < MIN_MARKERS:
         worst = int(np.argmax(distance))
         found = (
@@ -157,22 +172,28 @@ def _dots_on_body(shape: Shape, q: Array, dots: Dots, distance: Array, left_out:
 
 def _reason(shape: Shape, q: Array, dots: Dots) -> str:
     """Whether another place or another size of the body would put the dots on its faces, and what to do."""
-    pose = align_with_surface(shape, q, dots).pose
-    moved = pose.apply(dots.position)
-    distance = carry_back(shape, q, replace(dots, position=moved)).distance
-    if np.mean(distance > MAX_DISTANCE) <= 1.0 / MARKERS_PER_OUTLIER:
-        x, y, z = 1e3 * (moved - dots.position).mean(axis=0)
-        turn = np.degrees(np.arccos(np.clip((np.trace(pose.rotation) - 1.0) / 2.0, -1.0, 1.0)))
+    middle = 0.5 * (q.min(axis=0) + q.max(axis=0) - dots.position.min(axis=0) - dots.position.max(axis=0))
+    best: tuple[Array, RigidTransform] | None = None
+    for shift in (np.zeros(3), *np.diag(middle)):  # along each axis, the middle of the dots to that of the body
+        pose = align_with_surface(shape, q, dots, RigidTransform(np.eye(3), shift), HARDLY_TOLD).pose
+        moved = pose.apply(dots.position)
+        distance = carry_back(shape, q, replace(dots, position=moved)).distance
+        motion = moved - dots.position
+        if np.mean(distance > MAX_DISTANCE) <= 1.0 / MARKERS_PER_OUTLIER and (
+            best is None or np.linalg.norm(motion) < np.linalg.norm(best[0])
+        ):
+            best = motion, pose
+    if best is not None:
+        x, y, z = 1e3 * best[0].mean(axis=0)
+        turn = np.degrees(np.arccos(np.clip((np.trace(best[1].rotation) - 1.0) / 2.0, -1.0, 1.0)))
         return (
-            f"moved by {x:.1f}, {y:.1f}, {z:.1f} mm along x, y, z and turned by {turn:.1f} degrees they would lie on "
-            "it, so the world of the recording is not the specimen's frame (origin at the lower corner of the clamped "
-            "face on the side of smallest y, x from clamp to tip, z up): calibrate with the board at that corner, or "
-            "set the origin of the motion capture there"
+            f"moved by about {x:.0f}, {y:.0f}, {z:.0f} mm along x, y, z and turned by {turn:.0f} degrees they would "
+            "lie on it, so the world of the recording is not the specimen's frame (origin at the lower corner of the "
+            "clamped face on the side of smallest y, x from clamp to tip, z up): calibrate with the board at that "
+            "corner, or set the origin of motion capture there"
         )
-    spans = (
-        " x ".join(f"{1e3 * span:.1f}" for span in np.ptp(p, axis=0)) for p in (dots.position, shape.mesh.vertices)
-    )
+    spans = [" x ".join(f"{1e3 * x:.1f}" for x in np.ptp(p, axis=0)) for p in (dots.position, shape.mesh.vertices)]
     return (
-        f"they span {next(spans)} mm along x, y, z and the body {next(spans)} mm, and at no other place would they lie "
-        "on it: correct the size or shape of the body, or its calibration's unit"
+        f"they span {spans[0]} mm along x, y, z and the body {spans[1]} mm, and at no other place would they lie on "
+        "it: correct the size or shape of the body, or the unit of the recording"
     )

@@ -54,7 +54,7 @@ def dots_at_rest(recording: Recording, label: str) -> Dots:
             "it again once it hangs still"
         )
     position, sigma = average_frames(recording.position[frames], recording.sigma[frames])
-    names = recording.names or tuple(str(number + 1) for number in range(position.shape[1]))
+    names = recording.names or tuple(str(number + 1) for number in range(len(position)))
     dots = Dots(names, position, sigma).select(np.isfinite(position[:, 0]))
     if len(dots.names) < MIN_MARKERS:
         raise InputError(

@@ -12,6 +12,8 @@ from rafl.fem.mesh import HexMesh
 
 Array = NDArray[Any]
 
+DIGITS, SAME_DISTANCE = 9, 1e-9  # of distances that count as equal [m]
+
 
 @dataclass(frozen=True)
 class Markers:
@@ -92,18 +94,22 @@ def embed(mesh: HexMesh, names: tuple[str, ...], points: Array) -> Markers:
         points: positions in the specimen frame [m], (M, 3).
     """
     corners = mesh.vertices[mesh.surface]  # (S, 4, 3)
+    low, high = corners.min(axis=1), corners.max(axis=1)
     quads, weights, offsets = [], [], []
     for point in points:
         nearest = None
-        reach = np.abs(corners - point).max(axis=2).min(axis=1)
-        for index in np.flatnonzero(reach <= reach.min() + _longest_edge(corners)):
+        least = np.linalg.norm(np.maximum(np.maximum(low - point, point - high), 0.0), axis=1)
+        for index in np.argsort(least):
+            if nearest is not None and least[index] > nearest[0][0] + SAME_DISTANCE:
+                break
             s, t = _foot_point(corners[index], point)
             w = np.array([(1 - s) * (1 - t), s * (1 - t), s * t, (1 - s) * t])
             gap = point - w @ corners[index]
             normal = _normal(corners[index], s, t)
             offset = float(gap @ normal)
             # Several quads are equally near to a point off a corner: take the one with the least sideways offset.
-            key = (round(float(np.linalg.norm(gap)), 9), round(float(np.linalg.norm(gap - offset * normal)), 9))
+            sideways = float(np.linalg.norm(gap - offset * normal))
+            key = (round(float(np.linalg.norm(gap)), DIGITS), round(sideways, DIGITS), index)
             if nearest is None or key < nearest[0]:
                 nearest = (key, index, w, offset)
         assert nearest is not None
@@ -117,10 +123,6 @@ def embedding_gap(mesh: HexMesh, markers: Markers) -> Array:
     """Distances between the embedded markers and their layout positions at rest [m], (M,)."""
     embedded = markers.positions(torch.from_numpy(mesh.vertices)).numpy()
     return np.asarray(np.linalg.norm(embedded - markers.rest, axis=1))
-
-
-def _longest_edge(corners: Array) -> float:
-    return float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
 
 
 def _normal(corners: Array, s: float, t: float) -> Array:

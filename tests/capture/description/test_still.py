@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import FRAMES, SIDES, Still
+from stills import FRAMES, SIDES, still
 
 from rafl.capture.description.still import dots_at_rest
 from rafl.capture.registration.recording import Recording
@@ -25,21 +25,21 @@ def longer(recording: Recording, motion: np.ndarray) -> Recording:
     return replace(recording, time=np.arange(len(position)) / 100.0, position=position, sigma=sigma)
 
 
-def test_all_frames_are_averaged_if_nothing_moves(still: Still) -> None:
+def test_all_frames_are_averaged_if_nothing_moves() -> None:
     recording = still(SIDES)
     dots = dots_at_rest(recording, "still.h5")
     np.testing.assert_allclose(dots.position, recording.position.mean(axis=0), atol=1e-12)
     assert dots.names == recording.names
 
 
-def test_the_rest_before_a_release_is_averaged(still: Still) -> None:
+def test_the_rest_before_a_release_is_averaged() -> None:
     recording = still(SIDES)
     dots = dots_at_rest(longer(recording, swing(40)), "still.h5")
     assert np.abs(dots.position - recording.position.mean(axis=0)).max() < 2e-5
     assert np.abs(longer(recording, swing(40)).position.mean(axis=0) - recording.position.mean(axis=0)).max() > 2e-3
 
 
-def test_a_recording_that_never_rests_is_refused(still: Still) -> None:
+def test_a_recording_that_never_rests_is_refused() -> None:
     recording = still(SIDES)
     moving = replace(longer(recording, swing(40)))
     moving = replace(moving, **{key: getattr(moving, key)[FRAMES + 3 :] for key in ("time", "position", "sigma")})
@@ -47,7 +47,7 @@ def test_a_recording_that_never_rests_is_refused(still: Still) -> None:
         dots_at_rest(moving, "still.h5")
 
 
-def test_two_dots_are_too_few(still: Still) -> None:
+def test_two_dots_are_too_few() -> None:
     recording = still(SIDES)
     position = recording.position.copy()
     position[:, 2:] = np.nan
