@@ -1,6 +1,7 @@
 """HDF5 files: written from memory, and read without trust in who made them."""
 
 import math
+import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -30,7 +31,8 @@ def write_hdf5(path: Path, read_back: ReadBack | None = None) -> Iterator[h5py.F
     Raises:
         InputError: `path` cannot be written, or what was written cannot be read back.
     """
-    with h5py.File("in memory", "w", driver="core", backing_store=False) as file:
+    # HDF5 opens no name twice, and several threads may write at once.
+    with h5py.File(f"in memory {uuid.uuid4()}", "w", driver="core", backing_store=False) as file:
         yield file
         file.flush()
         content = file.id.get_file_image()

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from rafl.common.arrays import ArrayFormat, check_shape, check_values
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors, loss_curvature, recording_losses
@@ -113,8 +114,12 @@ class MaterialSearch:
         if checkpoint.exists():
             saved = load_tensors(checkpoint, "a checkpoint of this run")
             with expect_content("a checkpoint of this version", checkpoint):
-                self.evaluations = {tuple(key): Evaluation(*values) for key, *values in saved["known"]}
-                self.curvatures = {tuple(key): np.array(value) for key, value in saved["curvatures"]}
+                count, size = len(self.recording_names), len(quantities)
+                for key, losses, gradients in saved["known"]:
+                    values = _numbers(losses, (count,)).tolist(), _numbers(gradients, (count, size)).tolist()
+                    self.evaluations[tuple(_numbers(key, (1 + size,)).tolist())] = Evaluation(*values)
+                for key, value in saved["curvatures"]:
+                    self.curvatures[tuple(_numbers(key, (1 + size,)).tolist())] = _numbers(value, (size, size))
 
     @property
     def recording_names(self) -> list[str]:
@@ -352,3 +357,15 @@ def _spread_by_size(sizes: Array, count: int) -> list[int]:
     order = np.argsort(sizes)
     ranks = np.round(np.linspace(len(order) - 1, 0, min(count, len(order)))).astype(int)
     return sorted(order[np.unique(ranks)].tolist())
+
+
+def _numbers(content: Any, shape: tuple[int, ...]) -> Array:
+    """Finite numbers of a checkpoint as an array.
+
+    Raises:
+        ValueError: other content, or another shape.
+    """
+    array = np.array(content)
+    check_shape("numbers", array, ArrayFormat(shape), {})
+    check_values("numbers", array, ArrayFormat(shape))
+    return array.astype(float)

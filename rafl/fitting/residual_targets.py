@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
+from rafl.common.arrays import ArrayFormat, check_shape, check_values
 from rafl.common.command_line import progress
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import Dataset
@@ -117,6 +118,11 @@ def training_targets(
         save_tensors(path, {"format": FORMAT, "method": "residual forces", **content})
     saved = load_tensors(path, "residual targets of this run")
     with expect_content("residual targets of this run", path):
+        count = len(saved["q"])
+        for key in ("q", "v", "force"):
+            expected = ArrayFormat((count, len(dataset.simulator.mesh.vertices), 3))
+            check_shape(key, saved[key].numpy(), expected, {})
+            check_values(key, saved[key].numpy(), expected)
         return saved["q"], saved["v"], saved["force"]
 
 

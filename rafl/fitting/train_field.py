@@ -337,7 +337,11 @@ class _Training:
             self.optimiser.load_state_dict(saved["optimiser"])
             self.schedule.load_state_dict(saved["schedule"])
             self.shuffle.set_state(saved["shuffle"])
-            self.history = [{**row} for row in saved["history"]]
+            self.history = [{str(key): float(value) for key, value in row.items()} for row in saved["history"]]
+            for weight, state in self.optimiser.state.items():
+                kept = [value for value in state.values() if value.dim()]
+                if any(value.shape != weight.shape or not value.isfinite().all() for value in (weight, *kept)):
+                    raise ValueError("the optimiser's state has other shapes than the weights, or infinite numbers")
 
     def _save(self, best: bool) -> None:
         """Write the model, if it is the best so far, the checkpoint and the history; report the last epoch."""

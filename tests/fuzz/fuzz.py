@@ -97,13 +97,15 @@ class Worker:
         self.connection.close()
 
 
-def run_trials(seeds: list[int], jobs: int, laboratory: Path, folder: Path) -> list[dict[str, object]]:
+def run_trials(seeds: list[int], jobs: int, minutes: float, laboratory: Path, folder: Path) -> list[dict[str, object]]:
     """The outcomes of the trials, by `trials.Outcome`, with seed and seconds."""
-    waiting, outcomes = list(reversed(seeds)), []
+    waiting, outcomes, end = list(reversed(seeds)), [], time.monotonic() + 60.0 * minutes
     workers = [Worker(laboratory, folder) for _ in range(min(jobs, len(seeds)))]
     for worker in workers:
         worker.begin(waiting.pop())
     while workers:
+        if time.monotonic() > end:
+            waiting.clear()
         ready = wait([worker.connection for worker in workers], 1.0)
         for worker in list(workers):
             seconds = time.monotonic() - worker.started
@@ -154,6 +156,7 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=1000)
     parser.add_argument("--seed", type=int, default=0, help="of the first trial; each has the next number")
     parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--minutes", type=float, default=60.0, help="after which no trial begins")
     parser.add_argument("--log", type=Path, help="write every outcome to this file, one JSON object a line")
     options = parser.parse_args()
     start = time.monotonic()
@@ -165,7 +168,7 @@ def main() -> None:
         first.join()
         laboratory = folder / "laboratory"
         seeds = list(range(options.seed, options.seed + options.trials))
-        outcomes = run_trials(seeds, options.jobs, laboratory, folder)
+        outcomes = run_trials(seeds, options.jobs, options.minutes, laboratory, folder)
     if options.log:
         options.log.write_text("".join(json.dumps(item) + "\n" for item in outcomes))
     print_counts(outcomes)

@@ -70,6 +70,8 @@ TARGETS: dict[str, tuple[str, tuple[str, ...]]] = {
 # Targets of which one trial takes seconds are chosen less often than the others.
 WEIGHTS = {name: 0.25 if "evaluate" in name or name == "video" else 1.0 for name in TARGETS}
 FAULTS = ("space", "write", "flush", "rename", "memory", "interruption")
+# Faults at a time when some of several files are in their places, all of them whole.
+LATE_FAULTS = ("fault: rename", "fault: flush", "fault: interruption")
 FAULT_SHARE = 0.12  # of the trials
 
 Content = dict[str, str]
@@ -194,7 +196,8 @@ def _wrong(code: int, stderr: str, through: BaseException | None) -> str:
     if code not in (0, 1, 2, 130):
         return f"exit code {code}: {lines}"
     errors = [line for line in lines if line.startswith("error: ")]
-    if code == 2 and (len(lines) != 1 or len(errors) != 1):
+    others = [line for line in lines if not line.startswith(("error: ", "epoch ", "pre-training "))]
+    if code == 2 and (others or len(errors) != 1):
         return f"expected one line, found {lines}"
     return f"expected a message, found {lines}" if code == 1 and not errors else ""
 
@@ -206,7 +209,7 @@ def _wrong_files(before: Content, after: Content, code: int, line: tuple[str, ..
     outside = [path for path in changed if not path.startswith(("a/b/out", "a/b/new-run", "a/b/tracks", "a/b/run"))]
     if hidden or outside:
         return f"files that no one asked for: {hidden or outside}"
-    whole = "--resume" in line or "new-run" in line or line[0] == "rafl-track" or kind == "fault: rename"
+    whole = "--resume" in line or "new-run" in line or line[0] == "rafl-track" or kind in LATE_FAULTS
     if code and changed and not whole:  # commands that write several files, of which some may be there already
         return f"exit code {code}, and files changed: {changed}"
     if code and any(path.startswith("a/b/new-run") for path in changed) and not any(p.endswith(".pt") for p in changed):

@@ -84,6 +84,14 @@ def test_file_packed_with_gzip_is_read(tmp_path: Path) -> None:
         assert file["x"].shape == (1 << 20,)
 
 
+def test_several_files_are_written_at_once(tmp_path: Path) -> None:
+    with write_hdf5(tmp_path / "a.h5") as one, write_hdf5(tmp_path / "b.h5") as other:
+        one["x"], other["x"] = 1, 2
+    for name, value in (("a.h5", 1), ("b.h5", 2)):
+        with read_hdf5(tmp_path / name, "a file", "make it again") as file:
+            assert file["x"][()] == value
+
+
 def test_nothing_is_written_if_the_content_fails(tmp_path: Path) -> None:
     path = tmp_path / "new" / "file.h5"
     with pytest.raises(ZeroDivisionError), write_hdf5(path) as file:

@@ -32,6 +32,8 @@ REFUSED = {
     "nan": ("number: .nan", "number: Input should be a finite number, found nan"),
     "inf": ("number: -.inf", "found -inf"),
     "huge": ("number: 1.0e+300", "number: expected numbers of at most 1e+12, found 1e+300"),
+    "huge as text": ("number: 1e300", "number: expected numbers of at most 1e+12, found 1e300"),
+    "huge integer": ("number: " + "9" * 900, "number: expected numbers of at most 1e+12, found 99999999999999999999"),
     "text": ("number: wide", "found 'wide'"),
     "tag": ("number: !!python/object/apply:os.system [exit]", "not readable"),
     "unknown": ("nuber: 1", "nuber"),

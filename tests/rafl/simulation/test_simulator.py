@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 import torch
 
+from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import SimulationError
 from rafl.data.synthetic import twisted_shapes
 from rafl.fem.constitutive_state import ConstitutiveState
@@ -150,3 +151,21 @@ def test_released_twisted_beam_does_not_invert() -> None:
     q, _ = rollout(simulator, Start(start, none, none, none[..., 0], ("a", "b")), 12)
     F = torch.einsum("tbeni,egnj->tbegij", q[:, :, mesh.hexes], torch.from_numpy(mesh.quadrature.gradient))
     assert torch.linalg.det(F).min() > 0.8
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("youngs_modulus", -1.0),
+        ("youngs_modulus", float("nan")),
+        ("youngs_modulus", [1e5, 0.0]),
+        ("poissons_ratio", 0.5),
+        ("density", float("inf")),
+        ("viscosity", -1e-9),
+        ("gravity", [0.0, float("nan"), 0.0]),
+        ("stiffness", 1e5),
+    ],
+)
+def test_parameters_outside_their_range_are_refused(small_specimen: Specimen, key: str, value: object) -> None:
+    with pytest.raises(ValueError, match=rf"expected .*{key}"):
+        small_specimen.simulator(0.01).parameters(**{key: value})
