@@ -49,7 +49,7 @@ def body_of_surface(name: str, surface: Path, element_mm: float | None, folder: 
         folder: of the specimen file, which names the surface relative to it.
 
     Raises:
-        InputError: no such surface, or it is so thin that it would need too many elements.
+        InputError: no such surface, it lies in another folder, or it is so thin that it would need too many elements.
     """
     size = np.ptp(read_surface(surface).bounds, axis=0)
     element = element_mm or float(f"{min(ELEMENT_MM, size.min() / MIN_ACROSS_SURFACE):.2g}")
@@ -61,7 +61,7 @@ def body_like(name: str, path: Path, folder: Path) -> Body:
     """The body of another specimen file, whose markers are left out.
 
     Raises:
-        InputError: the file cannot be read.
+        InputError: the file cannot be read, or its surface lies in another folder.
     """
     content = read_specimen_file(path)
     values = content.model_dump(exclude_unset=True, exclude={"markers"}) | {"name": name}
@@ -92,8 +92,17 @@ def _body(name: str, shape: dict[str, object]) -> Body:
 
 
 def relative_path(path: Path, folder: Path) -> str:
-    """The path of a file as seen from a folder."""
-    return Path(os.path.relpath(path, folder)).as_posix()
+    """The path of a file as seen from a folder that contains it.
+
+    Raises:
+        InputError: the folder does not contain it; a specimen file names no files elsewhere.
+    """
+    relative = Path(os.path.relpath(path, folder))
+    if ".." in relative.parts:
+        raise InputError(
+            f"expected {path.name} beside the specimen file, in {folder}, found it elsewhere; copy it there"
+        )
+    return relative.as_posix()
 
 
 def specimen_text(body: Body, markers: list[dict[str, object]], remarks: dict[str, str]) -> str:

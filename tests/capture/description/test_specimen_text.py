@@ -45,15 +45,18 @@ def test_a_body_like_another_keeps_all_but_name_and_markers(tmp_path: Path) -> N
     assert found.integrator == expected.integrator
 
 
-def test_a_surface_in_another_folder_is_found(tmp_path: Path) -> None:
+def test_a_surface_lies_in_the_folder_of_the_specimen(tmp_path: Path) -> None:
     (tmp_path / "shapes").mkdir()
     trimesh.creation.box((60.0, 20.0, 20.0)).export(tmp_path / "shapes" / "box.stl")
-    body = body_of_surface("s", tmp_path / "shapes" / "box.stl", None, tmp_path / "out")
-    assert body.geometry.surface == "../shapes/box.stl"
+    body = body_of_surface("s", tmp_path / "shapes" / "box.stl", None, tmp_path)
+    assert body.geometry.surface == "shapes/box.stl"
     assert body.geometry.element_mm == 5.0
-    (tmp_path / "out").mkdir()
-    path = tmp_path / "out" / "s.yaml"
+    path = tmp_path / "s.yaml"
     path.write_text(specimen_text(body, [MARKER], REMARKS))
     assert read_specimen(path).volume == pytest.approx(24e-6)
     with pytest.raises(InputError, match="choose --element-mm"):
-        body_of_surface("s", tmp_path / "shapes" / "box.stl", 0.5, tmp_path / "out")
+        body_of_surface("s", tmp_path / "shapes" / "box.stl", 0.5, tmp_path)
+    with pytest.raises(
+        InputError, match=r"box\.stl beside the specimen file, in .*out, found it elsewhere; copy it there"
+    ):
+        body_of_surface("s", tmp_path / "shapes" / "box.stl", None, tmp_path / "out")
