@@ -337,7 +337,9 @@ class _Training:
             self.optimiser.load_state_dict(saved["optimiser"])
             self.schedule.load_state_dict(saved["schedule"])
             self.shuffle.set_state(saved["shuffle"])
-            self.history = [{str(key): float(value) for key, value in row.items()} for row in saved["history"]]
+            self.history = [{**row} for row in saved["history"]]
+            if not all(isinstance(value, (int, float)) for row in self.history for value in row.values()):
+                raise TypeError("a history of something else than numbers")
             for weight, state in self.optimiser.state.items():
                 kept = [value for value in state.values() if value.dim()]
                 if any(value.shape != weight.shape or not value.isfinite().all() for value in (weight, *kept)):

@@ -4,11 +4,13 @@ Workers run the trials in turn. One that ends, or takes too long or too much mem
 """
 
 import argparse
+import faulthandler
 import json
 import multiprocessing
 import os
 import resource
 import shutil
+import signal
 import sys
 import tempfile
 import time
@@ -55,6 +57,7 @@ def work(connection: Connection, laboratory: Path, folder: Path) -> None:
     """Run the trials whose seeds come through the connection."""
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MEMORY_LIMIT_BYTES,) * 2)
+    faulthandler.register(signal.SIGUSR1, (folder / f"stack-{os.getpid()}").open("w"))
     devnull = os.open(os.devnull, os.O_WRONLY)
     os.dup2(devnull, 2)  # what HDF5 and FFmpeg print by themselves
     for target in ("specimen", "dataset, fit", "dataset, evaluate", "calibration"):  # loads the kernels
@@ -90,6 +93,12 @@ class Worker:
             return 0.0
         return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK") - self.seconds_before
 
+    def stack(self, folder: Path) -> str:
+        """Where the process is, in all its threads."""
+        os.kill(self.process.pid or 0, signal.SIGUSR1)
+        time.sleep(1.0)
+        return (folder / f"stack-{self.process.pid}").read_text()
+
     def end(self) -> None:
         """Stop the process."""
         self.process.kill()
@@ -117,7 +126,7 @@ def run_trials(seeds: list[int], jobs: int, minutes: float, laboratory: Path, fo
                     worker.process.join()
                     found = {"wrong": f"the process ended with {worker.process.exitcode}"}
             elif worker.seconds() > TIME_LIMIT_S or seconds > 4.0 * TIME_LIMIT_S:
-                found = {"wrong": f"no end within {TIME_LIMIT_S:g} s"}
+                found = {"wrong": f"no end within {TIME_LIMIT_S:g} s:\n{worker.stack(folder)}"}
             if found is None:
                 continue
             outcomes.append({"target": "?", "kind": "?", "code": None, "message": "", **found})
