@@ -139,19 +139,20 @@ class PinholeCamera(Camera):
     translation: tuple[float, float, float]
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
 
-    def _to_camera_frame(self, points: Array) -> Array:
+    def to_camera_frame(self, points: Array) -> Array:
+        """World points (..., 3) [m] in the camera frame; the last coordinate is the distance in front of the camera."""
         result: Array = points @ self.rotation.T + np.asarray(self.translation)
         return result
 
     def project_undistorted(self, points: Array) -> Array:
         """See `Camera`."""
-        local = self._to_camera_frame(points)
+        local = self.to_camera_frame(points)
         result: Array = local[..., :2] / local[..., 2:] * np.asarray(self.focal) + np.asarray(self.centre)
         return result
 
     def projection_jacobian(self, points: Array) -> Array:
         """See `Camera`."""
-        local = self._to_camera_frame(points)
+        local = self.to_camera_frame(points)
         depth = local[..., 2, None, None]
         focal = np.asarray(self.focal)[:, None]
         result: Array = focal / depth * (self.rotation[:2] - local[..., :2, None] / depth * self.rotation[2])
