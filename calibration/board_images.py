@@ -80,12 +80,16 @@ def _check_named_images(description: BoardFile, paths: dict[str, dict[str, Path]
 
 
 def _share_world(views: dict[str, list[View]]) -> bool:
-    """Whether every camera sees a board of known pose, or is connected with one that does through shared boards."""
+    """Whether every camera sees a board of known pose, or is connected with one that does through shared boards.
+
+    If no pose is known, the first camera's first board is the world.
+    """
     if len(views) == 1:
         return True
     connected = {name for name, own in views.items() if any(view.known_pose for view in own)}
     pose_keys = {name: {view.pose_key for view in own} for name, own in views.items()}
     known = {view.pose_key for own in views.values() for view in own if view.known_pose}
+    connected = connected or {next(iter(views))}
     connected |= {name for name in views if pose_keys[name] & known}
     while True:
         more = {
