@@ -1,6 +1,6 @@
-"""Calibration boards: their patterns, their known poses, and the detection of their points in an image."""
+"""Calibration boards: their patterns, their known poses, and the views of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -8,10 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, Field, field_validator, model_validator
-from scipy.spatial import cKDTree
 
+from rafl.calibration.detection.charuco import find_charuco
+from rafl.calibration.detection.chessboard import find_chessboard
+from rafl.calibration.detection.dots import find_dot_lattice
+from rafl.calibration.detection.lattice import Lattice, place_by_rings, place_by_size
 from rafl.calibration.fields import Direction
-from rafl.common.errors import InputError
 from rafl.common.yaml_files import StrictModel, read_yaml
 
 Array = NDArray[Any]
@@ -66,36 +68,41 @@ class CharucoPattern(StrictModel):
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, self.dictionary))
         return cv2.aruco.CharucoBoard(self.squares, 1e-3 * self.square_mm, 1e-3 * self.marker_mm, dictionary)
 
-    def find(self, image: NDArray[np.uint8]) -> tuple[Array, Array]:
-        """Detect the board in a grey image: its points (P, 2) [m] and their pixels (P, 2)."""
-        board = self.opencv_board()
-        corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
-        if ids is None or len(ids) < MIN_POINTS:
-            return np.zeros((0, 2)), np.zeros((0, 2))
-        points = np.asarray(board.getChessboardCorners(), dtype=float)[ids.ravel(), :2]
-        # The pixel origin of these corners is a pixel's edge in OpenCV 4 and its centre in OpenCV 5. Refined corners
-        # are relative to the centre in both.
-        spacing = cKDTree(corners.reshape(-1, 2)).query(corners.reshape(-1, 2), 2)[0][:, 1].min()
-        half = int(np.clip(0.15 * spacing, 2, 10))
-        stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-4)
-        refined = cv2.cornerSubPix(image, np.array(corners, dtype=np.float32), (half, half), (-1, -1), stop)
-        return points, np.asarray(refined, dtype=float).reshape(-1, 2)
+    def find(self, image: NDArray[np.uint8]) -> "Detection":
+        """Detect the board in a grey image, (H, W). Boards of OpenCV before 4.6 are recognised too."""
+        return Detection(*find_charuco(image, self.opencv_board()))
 
 
 class DotGridPattern(StrictModel):
-    """A grid of `dots` columns x rows of dark dots. Origin: the corner dot nearest the top left of the image."""
+    """A grid of dark dots, numbered by `dots` columns x rows or by three ringed dots.
+
+    With `dots`, the origin is the corner dot nearest the top left of the image. With `rings`, it is the ringed dot at
+    the corner of the three; the others are `rings[0]` dots along x and `rings[1]` along y. x is right and y down.
+    """
 
     kind: Literal["dot-grid"]
-    dots: tuple[int, int]
+    dots: tuple[int, int] | None = None
+    rings: tuple[int, int] | None = None
     spacing_mm: float = Field(gt=0)
 
-    def find(self, image: NDArray[np.uint8]) -> tuple[Array, Array]:
-        """Detect the board in a grey image: its points (P, 2) [m] and their pixels (P, 2)."""
-        columns, rows = self.dots
-        found, centres = cv2.findCirclesGrid(image, (columns, rows), flags=cv2.CALIB_CB_SYMMETRIC_GRID)
-        if not found:
-            return np.zeros((0, 2)), np.zeros((0, 2))
-        return _order_grid(np.asarray(centres, dtype=float), self.dots, self.spacing_mm)
+    @model_validator(mode="after")
+    def _check_numbering(self) -> "DotGridPattern":
+        if (self.dots is None) == (self.rings is None):
+            raise ValueError("expected either `dots` (columns and rows) or `rings` (places of the ringed dots)")
+        if self.rings is not None and 0 in self.rings:
+            raise ValueError("expected `rings` that are not 0: spacings from the corner ring to the others")
+        return self
+
+    def find(self, image: NDArray[np.uint8]) -> "Detection":
+        """Detect the board in a grey image, (H, W)."""
+        found = find_dot_lattice(image)
+        if found is None:
+            return Detection()
+        if self.dots is not None:
+            return _detection(found[0], self.dots, self.spacing_mm, image)
+        assert self.rings is not None
+        placed, origin_known = place_by_rings(*found, self.rings)
+        return Detection(1e-3 * self.spacing_mm * placed.indices, placed.pixels, origin_known)
 
 
 class ChessboardPattern(StrictModel):
@@ -105,30 +112,35 @@ class ChessboardPattern(StrictModel):
     corners: tuple[int, int]
     square_mm: float = Field(gt=0)
 
-    def find(self, image: NDArray[np.uint8]) -> tuple[Array, Array]:
-        """Detect the board in a grey image: its points (P, 2) [m] and their pixels (P, 2)."""
-        flags = cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_NORMALIZE_IMAGE
-        found, corners = cv2.findChessboardCornersSB(image, self.corners, flags=flags)
-        if not found:
-            return np.zeros((0, 2)), np.zeros((0, 2))
-        return _order_grid(np.asarray(corners, dtype=float), self.corners, self.square_mm)
+    def find(self, image: NDArray[np.uint8]) -> "Detection":
+        """Detect the board in a grey image, (H, W)."""
+        found = find_chessboard(image, self.corners)
+        return Detection() if found is None else _detection(found, self.corners, self.square_mm, image)
 
 
-def _order_grid(found: Array, size: tuple[int, int], spacing_mm: float) -> tuple[Array, Array]:
-    """Board points (P, 2) [m] and pixels (P, 2) of a detected grid.
+@dataclass(frozen=True)
+class Detection:
+    """What was found of a board in an image.
 
-    Of the two ends of the grid, the origin is the one nearer the top left of the image. A mirrored grid is flipped.
+    Attributes:
+        points: board frame [m], (P, 2).
+        pixels: of the points, (P, 2).
+        origin_known: whether the board's origin is; else that of the points is a corner of the part that is seen.
+        other_size: columns and rows of a board of another size, if one was found; there are no points then.
     """
-    columns, rows = size
-    grid = found.reshape(rows, columns, 2)
-    if grid[0, 0].sum() > grid[-1, -1].sum():
-        grid = grid[::-1, ::-1]
-    across, down = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
-    if across[0] * down[1] - across[1] * down[0] < 0:
-        grid = grid[:, ::-1]
-    j, i = np.meshgrid(np.arange(columns), np.arange(rows))
-    points = 1e-3 * spacing_mm * np.stack([j, i], axis=-1)
-    return points.reshape(-1, 2), grid.reshape(-1, 2)
+
+    points: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    pixels: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    origin_known: bool = True
+    other_size: tuple[int, int] | None = None
+
+
+def _detection(found: Lattice, size: tuple[int, int], spacing_mm: float, image: NDArray[np.uint8]) -> Detection:
+    """Detection of a board of `size` columns x rows from the lattice of its points in an image."""
+    placed, whole = place_by_size(found, size, (image.shape[1], image.shape[0]))
+    if placed is None:
+        return Detection(other_size=found.size)
+    return Detection(1e-3 * spacing_mm * placed.indices, placed.pixels, whole)
 
 
 class Move(StrictModel):
@@ -173,6 +185,8 @@ class View:
         points: detected points, board frame [m], (P, 2).
         pixels: their pixels, (P, 2).
         known_pose: pose of the board in the world, if known.
+        origin_known: whether the points are relative to the board's origin; else a part of the board is seen, and they
+            are relative to a corner of that part.
     """
 
     name: str
@@ -180,6 +194,7 @@ class View:
     points: Array
     pixels: Array
     known_pose: WorldPose | None
+    origin_known: bool = True
 
 
 def read_board(path: Path) -> BoardFile:
@@ -189,23 +204,3 @@ def read_board(path: Path) -> BoardFile:
         InputError: the file is missing, damaged or of a newer version.
     """
     return read_yaml(path, BoardFile, "a board description (board.yaml)", FORMAT)
-
-
-def find_board(path: Path, name: str, board: BoardFile) -> tuple[View | None, tuple[int, int]]:
-    """Detect the board in an image (None if too few of its points are seen), and return the image size [px] too.
-
-    Raises:
-        InputError: the image cannot be read.
-    """
-    try:
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:  # the header claims an image too large for OpenCV
-        image = None
-    if image is None:
-        raise InputError(f"expected an image of the board in {path}, which cannot be read; replace it")
-    size = (image.shape[1], image.shape[0])
-    points, pixels = board.pattern.find(image)
-    if len(points) < MIN_POINTS:
-        return None, size
-    pose_key = name.partition("/")[2] if board.simultaneous else name
-    return View(name, pose_key, points, pixels, board.world.get(name)), size

@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from rafl.calibration.board import BoardFile, View, find_board
+from rafl.calibration.board import MIN_POINTS, BoardFile, View
+from rafl.calibration.detection.image_file import image_size, read_grey_image
 from rafl.common.command_line import progress
 from rafl.common.errors import InputError
 
@@ -18,8 +19,8 @@ def board_views(images: Path, description: BoardFile) -> tuple[Views, Sizes]:
     Each subfolder of `images` is a camera. Without subfolders, `images` itself is one camera.
 
     Raises:
-        InputError: there are no images, an image cannot be read, a camera's images differ in size, or the description
-            names an image that is not there.
+        InputError: there are no images, an image cannot be read, a camera's images differ in size, the description
+            names an image that is not there, or the board in the images has another size than described.
     """
     if not images.is_dir():
         raise InputError(f"expected a folder of board images at {images}, found none; check the path")
@@ -29,6 +30,11 @@ def board_views(images: Path, description: BoardFile) -> tuple[Views, Sizes]:
     for name, own in paths.items():
         views[name], sizes[name] = _find_views(name, own, description)
     return views, sizes
+
+
+def image_path(images: Path, name: str) -> Path:
+    """Path of the image `camera/file` in a folder of board images, with or without subfolders."""
+    return images / name if (images / name).exists() else images / name.partition("/")[2]
 
 
 def check_shared_world(views: Views) -> None:
@@ -74,12 +80,16 @@ def _check_named_images(description: BoardFile, paths: dict[str, dict[str, Path]
 
 
 def _share_world(views: dict[str, list[View]]) -> bool:
-    """Whether every camera sees a board of known pose, or is connected with one that does through shared boards."""
+    """Whether every camera sees a board of known pose, or is connected with one that does through shared boards.
+
+    If no pose is known, the first camera's first board is the world.
+    """
     if len(views) == 1:
         return True
     connected = {name for name, own in views.items() if any(view.known_pose for view in own)}
     pose_keys = {name: {view.pose_key for view in own} for name, own in views.items()}
     known = {view.pose_key for own in views.values() for view in own if view.known_pose}
+    connected = connected or {next(iter(views))}
     connected |= {name for name in views if pose_keys[name] & known}
     while True:
         more = {
@@ -93,20 +103,35 @@ def _share_world(views: dict[str, list[View]]) -> bool:
 
 
 def _find_views(camera: str, paths: dict[str, Path], description: BoardFile) -> tuple[list[View], tuple[int, int]]:
-    views: list[View] = []
     sizes: dict[tuple[int, int], str] = {}
-    with progress() as bar:
-        for name, path in bar.track(paths.items(), description=f"{camera}: finding the board"):
-            view, size = find_board(path, name, description)
-            sizes.setdefault(size, name)
-            if view is not None:
-                views.append(view)
-            elif name in description.world:
-                raise InputError(
-                    f"{path}: board.yaml gives the pose of the board in this image, but no board was found there; "
-                    "check the pattern in board.yaml, or take the image again"
-                )
+    for name, path in paths.items():
+        sizes.setdefault(image_size(path), name)
     if len(sizes) > 1:
         found = ", ".join(f"{name} {w} x {h}" for (w, h), name in sizes.items())
         raise InputError(f"camera {camera}: expected images of one size, found {found}; remove the others")
+    placed = {*description.world, *(name for move in description.moved for name in (move.from_, move.to))}
+    views: list[View] = []
+    other_size: list[tuple[str, tuple[int, int]]] = []
+    with progress() as bar:
+        for name, path in bar.track(paths.items(), description=f"{camera}: finding the board"):
+            found_board = description.pattern.find(read_grey_image(path))
+            if found_board.other_size:
+                other_size.append((name, found_board.other_size))
+            needs_origin = description.simultaneous or name in placed
+            if len(found_board.points) >= MIN_POINTS and (found_board.origin_known or not needs_origin):
+                pose_key = name.partition("/")[2] if description.simultaneous else name
+                own = (found_board.points, found_board.pixels, description.world.get(name), found_board.origin_known)
+                views.append(View(name, pose_key, *own))
+            elif name in description.world:
+                part = "only a part of a board without its origin" if len(found_board.points) else "no board"
+                raise InputError(
+                    f"{path}: board.yaml gives the pose of the board in this image, but {part} was found there; "
+                    "check the pattern in board.yaml, or take the image again"
+                )
+    if len(other_size) > sum(view.origin_known for view in views):
+        name, (columns, rows) = other_size[0]
+        raise InputError(
+            f"{name}: expected the board that board.yaml describes, found one of {columns} x {rows} points; "
+            "correct the pattern in board.yaml (of a chessboard, the inner corners count)"
+        )
     return views, next(iter(sizes))

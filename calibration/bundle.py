@@ -1,7 +1,9 @@
 """Bundle adjustment of cameras and board poses.
 
-Every camera maps a world point X to p = R X and u = centre + (K2 p_xy + offset) / (1 + inverse_distance p_z). Radial
-distortion follows. An inverse distance of 0 gives the orthographic camera, otherwise a pinhole at 1 / inverse_distance.
+Every camera maps a world point X to p = R X and u = centre + (K2 p_xy + offset) / (1 + inverse_distance p_z).
+Distortion about the centre follows. An inverse distance of 0 gives the orthographic camera, otherwise a pinhole at
+1 / inverse_distance. The distortion of a pinhole is that of OpenCV, for lengths in units of half the image diagonal; an
+orthographic camera has its radial part k1, k2 only. The centre is the image centre, moved for a pinhole if asked for.
 """
 
 from collections.abc import Callable
@@ -16,9 +18,11 @@ from rafl.calibration.camera import centre_and_half_diagonal
 
 Array = NDArray[Any]
 
-# mx, my, skew [px/mm], rotation vector, offset from the image centre [px], k1, k2, inverse distance [1/m]
-CAMERA_PARAMETERS = 11
+# mx, my, skew [px/mm], rotation vector, offset from the centre [px], k1, k2, inverse distance [1/m], shift of the
+# centre [px], p1, p2, k3
+CAMERA_PARAMETERS = 16
 INVERSE_DISTANCE = 10  # index of that camera parameter
+LENS = slice(11, 16)  # indices of the shift of the centre, p1, p2 and k3
 POSE_PARAMETERS = 6  # rotation vector, position [m]
 MAX_ITERATIONS = 80
 HUBER_THRESHOLD_PX = 0.5  # the cost of a larger residual grows linearly
@@ -51,7 +55,7 @@ class Observations:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Camera parameters (C, 11), board poses (B, 6) and distances of the moves (D) [m]."""
+    """Camera parameters (C, 16), board poses (B, 6) and distances of the moves (D) [m]."""
 
     cameras: Array
     poses: Array
@@ -65,7 +69,7 @@ class Adjustment:
     Attributes:
         unknowns: the solution.
         residual: residual of every observation [px], (O, 2).
-        covariance: covariance of each camera's parameters, (C, 11, 11).
+        covariance: covariance of each camera's parameters, (C, 16, 16).
     """
 
     unknowns: Unknowns
@@ -101,13 +105,24 @@ def project_observations(observations: Observations, unknowns: Unknowns) -> Arra
     sizes = [centre_and_half_diagonal(tuple(size)) for size in observations.sizes]
     centre = np.array([c for c, _ in sizes])[observations.camera]
     half_diagonal = np.array([h for _, h in sizes])[observations.camera]
-    r2 = (offset**2).sum(1) / half_diagonal**2
-    pixels: Array = centre + offset * (1.0 + own[:, 8] * r2 + own[:, 9] * r2**2)[:, None]
+    # OpenCV distorts lengths in units of the focal lengths, the orthographic model those in pixels.
+    aspect = np.where(own[:, INVERSE_DISTANCE, None] != 0.0, own[:, :2] / own[:, :2].mean(axis=1)[:, None], 1.0)
+    x, y = (offset / (aspect * half_diagonal[:, None])).T
+    p1, p2, k3 = own[:, 13], own[:, 14], own[:, 15]
+    r2 = x**2 + y**2
+    radial = (1.0 + own[:, 8] * r2 + own[:, 9] * r2**2 + k3 * r2**3)[:, None]
+    tangential = np.stack([2 * p1 * x * y + p2 * (r2 + 2 * x**2), p1 * (r2 + 2 * y**2) + 2 * p2 * x * y], axis=1)
+    pixels: Array = centre + own[:, 11:13] + offset * radial + aspect * half_diagonal[:, None] * tangential
     return pixels
 
 
 def adjust_bundle(
-    observations: Observations, start: Unknowns, *, perspective: bool = False, fixed_cameras: bool = False
+    observations: Observations,
+    start: Unknowns,
+    *,
+    perspective: bool = False,
+    lens: bool = False,
+    fixed_cameras: bool = False,
 ) -> Adjustment:
     """Robust least squares over all cameras, free board poses and move distances.
 
@@ -115,11 +130,13 @@ def adjust_bundle(
         observations: the observed points.
         start: initial guess near the solution.
         perspective: whether to solve for the inverse distances of the cameras; otherwise they keep their values.
+        lens: whether to solve for the shift of the centre, p1, p2 and k3; otherwise they keep their values.
         fixed_cameras: whether to keep the cameras and solve for the poses only.
     """
     own = np.ones(CAMERA_PARAMETERS, dtype=bool)
     own[INVERSE_DISTANCE] = perspective
     own[2] = not perspective  # the pinhole model has no skew
+    own[LENS] = lens
     if fixed_cameras:
         own[:] = False
     free = ~observations.known
@@ -186,6 +203,35 @@ def adjust_bundle(
         slots = camera_slots[camera, own]
         covariance[camera][np.ix_(own, own)] = full[np.ix_(slots, slots)]
     return Adjustment(unpack(x), residual, covariance)
+
+
+def move_points(observations: Observations, found: Adjustment, names: NDArray[np.int64]) -> Observations:
+    """The observations with the points of the board where the residuals of an adjustment put them.
+
+    A printed board is not exact. The moves have no affine part: the position, size and shape of the whole board stay.
+
+    Args:
+        observations: the observed points.
+        found: adjustment with these points.
+        names: number of each observed point on the board, (O).
+    """
+    step = 1e-6
+    derivatives = []
+    for direction in step * np.eye(2):
+        moved = (replace(observations, points=observations.points + sign * direction) for sign in (1, -1))
+        up, down = (project_observations(one, found.unknowns) for one in moved)
+        derivatives.append((up - down) / (2 * step))
+    jacobian = np.stack(derivatives, axis=2)
+    weight = np.minimum(1.0, HUBER_THRESHOLD_PX / np.maximum(np.linalg.norm(found.residual, axis=1), 1e-12))
+    normal, right = np.zeros((names.max() + 1, 2, 2)), np.zeros((names.max() + 1, 2))
+    np.add.at(normal, names, np.einsum("o,oki,okj->oij", weight, jacobian, jacobian))
+    np.add.at(right, names, -np.einsum("o,oki,ok->oi", weight, jacobian, found.residual))
+    shifts = np.linalg.solve(normal, right[..., None])[..., 0]
+    points = np.zeros_like(shifts)
+    points[names] = observations.points
+    affine = np.column_stack([points, np.ones(len(points))])
+    shifts -= affine @ np.linalg.lstsq(affine, shifts, rcond=None)[0]
+    return replace(observations, points=observations.points + shifts[names])
 
 
 def _levenberg_marquardt(residuals: Callable[[Array], Array], jacobian_at: Callable[[Array], Array], x: Array) -> Array:

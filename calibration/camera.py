@@ -161,7 +161,8 @@ class PinholeCamera(Camera):
     def _k2(self) -> Array:
         return np.array([[self.focal[0], self.skew], [0.0, self.focal[1]]])
 
-    def _to_camera_frame(self, points: Array) -> Array:
+    def to_camera_frame(self, points: Array) -> Array:
+        """World points (..., 3) [m] in the camera frame; the last coordinate is the distance in front of the camera."""
         result: Array = points @ self.rotation.T + np.asarray(self.translation)
         return result
 
@@ -172,12 +173,12 @@ class PinholeCamera(Camera):
 
     def project_undistorted(self, points: Array) -> Array:
         """See `Camera`."""
-        local = self._to_camera_frame(points)
+        local = self.to_camera_frame(points)
         return self._to_pixels(local[..., :2] / local[..., 2:])
 
     def projection_jacobian(self, points: Array) -> Array:
         """See `Camera`."""
-        local = self._to_camera_frame(points)
+        local = self.to_camera_frame(points)
         depth = local[..., 2, None, None]
         slopes = (self.rotation[:2] - local[..., :2, None] / depth * self.rotation[2]) / depth
         result: Array = self._k2 @ slopes

@@ -4,12 +4,13 @@ import itertools
 from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rafl.calibration.board import BoardFile, View, WorldPose
-from rafl.calibration.bundle import CAMERA_PARAMETERS, Observations, Unknowns
+from rafl.calibration.bundle import CAMERA_PARAMETERS, INVERSE_DISTANCE, Observations, Unknowns
 from rafl.calibration.camera import centre_and_half_diagonal
 from rafl.calibration.views import AffineView, fit_affine
 from rafl.common.errors import InputError
@@ -45,7 +46,7 @@ class CameraGroup:
     def of(
         cls, names: list[str], views: dict[str, list[View]], sizes: dict[str, tuple[int, int]], description: BoardFile
     ) -> "CameraGroup":
-        """Group some cameras of a rig. If no pose is known, the first board that was not moved is the world frame."""
+        """Group some cameras of a rig. If no pose is known, the first whole board not moved is the world frame."""
         own = [views[name] for name in names]
         key_of = {view.name: view.pose_key for group in own for view in group}
         moves = {
@@ -56,7 +57,10 @@ class CameraGroup:
         keys = list(dict.fromkeys(view.pose_key for group in own for view in group if view.pose_key not in moves))
         poses = {view.pose_key: view.known_pose for group in own for view in group if view.known_pose is not None}
         if not poses.keys() & set(keys):
-            poses[keys[0]] = WorldPose(origin_mm=(0, 0, 0), x_axis=(1, 0, 0), y_axis=(0, 1, 0))
+            first = next((view for group in own for view in group if view.origin_known and view.pose_key in keys), None)
+            poses[first.pose_key if first else keys[0]] = WorldPose(
+                origin_mm=(0, 0, 0), x_axis=(1, 0, 0), y_axis=(0, 1, 0)
+            )
         scales = [max(float(np.linalg.norm(fit_affine(view).matrix, 2)) for view in group) for group in own]
         affines = [[fit_affine(view, scale) for view in group] for group, scale in zip(own, scales, strict=True)]
         return cls(names, own, affines, scales, [sizes[name] for name in names], keys, poses, moves)
@@ -197,6 +201,62 @@ def initial_unknowns(group: CameraGroup, rotations: list[Array]) -> Unknowns:
         cameras[k, 6:8] = (np.mean(offsets, axis=0) if offsets else centre) - centre
     poses = np.array([_initial_pose(group, key, rotations, cameras) for key in group.pose_keys])
     return Unknowns(cameras, poses, np.full(len(group.moves), 0.02))
+
+
+def perspective_unknowns(group: CameraGroup) -> Unknowns | None:
+    """Pinhole cameras, board poses and move distances from the homographies of the views.
+
+    The focal lengths come from the homographies (Zhang, IEEE Trans. Pattern Analysis 22, 2000), the poses from OpenCV's
+    solvePnP. None if a view shows no perspective.
+    """
+    boards = {key: (pose.rotation, pose.origin) for key, pose in group.known_poses.items()}
+    cameras = np.zeros((len(group.names), CAMERA_PARAMETERS))
+    left = set(range(len(group.names)))
+    while left:
+        seen = [k for k in left if any(view.pose_key in boards for view in group.views[k])]
+        if not seen:
+            return None
+        k = seen[0]
+        left.remove(k)
+        local = _local_poses(group.views[k], group.sizes[k])
+        if local is None:
+            return None
+        focal, poses = local
+        reference = next(view.pose_key for view in group.views[k] if view.pose_key in boards)
+        rotation = poses[reference][0] @ boards[reference][0].T
+        translation = poses[reference][1] - rotation @ boards[reference][1]
+        if not translation[2] > 0.0:
+            return None
+        cameras[k, :2] = 1e-3 * focal / translation[2]
+        cameras[k, 3:6] = Rotation.from_matrix(rotation).as_rotvec()
+        cameras[k, 6:8] = focal * translation[:2] / translation[2]
+        cameras[k, INVERSE_DISTANCE] = 1.0 / translation[2]
+        for key, (own, place) in poses.items():
+            boards.setdefault(key, (rotation.T @ own, rotation.T @ (place - translation)))
+    if not boards.keys() >= {*group.pose_keys, *group.moves}:
+        return None
+    free = [np.append(Rotation.from_matrix(boards[k][0]).as_rotvec(), boards[k][1]) for k in group.pose_keys]
+    distances = [direction @ (boards[key][1] - boards[base][1]) for key, (base, direction) in group.moves.items()]
+    return Unknowns(cameras, np.array(free), np.array(distances, dtype=float))
+
+
+def _local_poses(views: list[View], size: tuple[int, int]) -> tuple[Array, dict[str, tuple[Array, Array]]] | None:
+    """Focal lengths (2) [px] of a camera, and the pose of each board in its frame, by key: rotation, translation."""
+    points = [np.column_stack([view.points, np.zeros(len(view.points))]).astype(np.float32) for view in views]
+    pixels = [view.pixels.astype(np.float32) for view in views]
+    matrix = cv2.initCameraMatrix2D(points, pixels, size, 0)
+    focal = np.diag(matrix)[:2]
+    if not (np.isfinite(focal).all() and (focal > 0.0).all()):
+        return None
+    centre, _ = centre_and_half_diagonal(size)
+    matrix = np.array([[focal[0], 0.0, centre[0]], [0.0, focal[1], centre[1]], [0.0, 0.0, 1.0]])
+    poses = {}
+    for view, own, seen in zip(views, points, pixels, strict=True):
+        found, vector, translation = cv2.solvePnP(own, seen, matrix, None, flags=cv2.SOLVEPNP_IPPE)
+        if not found:
+            return None
+        poses[view.pose_key] = (Rotation.from_rotvec(vector.ravel()).as_matrix(), translation.ravel())
+    return focal, poses
 
 
 def _initial_pose(group: CameraGroup, key: str, rotations: list[Array], cameras: Array) -> Array:

@@ -6,7 +6,7 @@ adjustment therefore starts from every mirrored rig. A solution is accepted only
 
 import itertools
 from collections import ChainMap
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +14,15 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from rafl.calibration.board import BoardFile, View
-from rafl.calibration.bundle import INVERSE_DISTANCE, Adjustment, Observations, adjust_bundle
+from rafl.calibration.bundle import INVERSE_DISTANCE, LENS, Adjustment, Observations, adjust_bundle, move_points
 from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane, centre_and_half_diagonal
-from rafl.calibration.initial_guess import CameraGroup, collect_observations, initial_rotations, initial_unknowns
+from rafl.calibration.initial_guess import (
+    CameraGroup,
+    collect_observations,
+    initial_rotations,
+    initial_unknowns,
+    perspective_unknowns,
+)
 from rafl.calibration.rig import PLANE_SIGMA_MM, Rig
 from rafl.calibration.views import check_views, farther_edge
 from rafl.common.errors import InputError
@@ -26,6 +32,7 @@ Array = NDArray[Any]
 SAME_ROTATION = np.radians(0.5)  # rotations closer than this count as one solution
 MAX_RESIDUAL_RATIO = 1.3  # a solution whose residual is this many times the best one is rejected
 MIN_PERSPECTIVE_SIGMAS = 4.0  # an inverse distance of more sigmas shows perspective
+BOARD_ROUNDS = 5  # of moving the points of the board and adjusting the rest; then the residual changes by 1 % a round
 COVARIANCE_PARAMETERS = 10  # camera parameters in the covariance in calib.yaml
 
 
@@ -39,12 +46,14 @@ class Solution:
         tilts: angle between the board and the image plane in each view [rad].
         inverse_distances: of each camera, 1 / distance from the world origin and its sigma [1/m]; 0 for an
             orthographic lens.
+        board_error: RMS distance of the board's points from where its description puts them [m], if the views show it.
     """
 
     rig: Rig
     view_residuals: dict[str, float]
     tilts: dict[str, float]
     inverse_distances: dict[str, tuple[float, float]]
+    board_error: float = 0.0
 
     def perspective_bias(self, camera: str, depth: float) -> float:
         """Position error [m] from perspective, of a marker at the image border and `depth` [m] off its plane."""
@@ -77,7 +86,7 @@ def solve_rig(
         InputError: the views do not determine the cameras, or leave a mirror ambiguity.
     """
     for name, own in views.items():
-        check_views(name, own)
+        check_views(name, own, model)
     solutions = [
         _solve_group(CameraGroup.of(names, views, sizes, description), tilt_signs, model)
         for names in _connected_cameras(views)
@@ -88,6 +97,7 @@ def solve_rig(
         dict(ChainMap(*(solution.view_residuals for solution in solutions))),
         dict(ChainMap(*(solution.tilts for solution in solutions))),
         dict(ChainMap(*(solution.inverse_distances for solution in solutions))),
+        max(solution.board_error for solution in solutions),
     )
 
 
@@ -105,8 +115,9 @@ def _connected_cameras(views: dict[str, list[View]]) -> list[list[str]]:
 def _solve_group(group: CameraGroup, tilt_signs: dict[str, int], model: str) -> Solution:
     observations = collect_observations(group)
     candidates: list[Adjustment] = []
-    for rotations in initial_rotations(group):
-        start = initial_unknowns(group, rotations)
+    starts = [initial_unknowns(group, rotations) for rotations in initial_rotations(group)]
+    near = perspective_unknowns(group) if model == "pinhole" else None
+    for start in [near, *starts] if near else starts:
         found = adjust_bundle(observations, start, perspective=model == "pinhole")
         if (found.unknowns.distances < 0).any() or not np.isfinite(found.robust_rms):
             continue
@@ -118,17 +129,57 @@ def _solve_group(group: CameraGroup, tilt_signs: dict[str, int], model: str) -> 
             "under `world` and the directions under `moved` in board.yaml"
         )
     chosen = _choose_solution(group, observations, candidates, tilt_signs)
-    inverse_distances = {name: (0.0, np.inf) for name in group.names}
     pinhole = chosen if model == "pinhole" else adjust_bundle(observations, chosen.unknowns, perspective=True)
-    for k, name in enumerate(group.names):
-        sigma = float(np.sqrt(pinhole.covariance[k, INVERSE_DISTANCE, INVERSE_DISTANCE]))
-        inverse_distances[name] = (float(pinhole.unknowns.cameras[k, INVERSE_DISTANCE]), sigma)
-        if model == "pinhole" and not inverse_distances[name][0] > MIN_PERSPECTIVE_SIGMAS * sigma:
-            raise InputError(
-                f"camera {name}: expected views with enough perspective to determine the distance of the camera, found "
-                "too little; use the orthographic model, or tilt the board more"
-            )
-    return _build_solution(group, observations, chosen, inverse_distances, model)
+    inverse_distances = _inverse_distances(group, pinhole)
+    board_error = 0.0
+    if model == "pinhole":
+        for name, (inverse_distance, sigma) in inverse_distances.items():
+            if not inverse_distance > MIN_PERSPECTIVE_SIGMAS * sigma:
+                raise InputError(
+                    f"camera {name}: expected views with enough perspective to determine the distance of the camera, "
+                    "found too little; use the orthographic model, or tilt the board more"
+                )
+        chosen, board_error = _fit_board(observations, _fit_lens(observations, chosen))
+        inverse_distances = _inverse_distances(group, chosen)
+    return replace(_build_solution(group, observations, chosen, inverse_distances, model), board_error=board_error)
+
+
+def _inverse_distances(group: CameraGroup, found: Adjustment) -> dict[str, tuple[float, float]]:
+    """Inverse distance [1/m] of each camera and its sigma, by name."""
+    values = found.unknowns.cameras[:, INVERSE_DISTANCE]
+    sigmas = np.sqrt(found.covariance[:, INVERSE_DISTANCE, INVERSE_DISTANCE])
+    return {name: (float(values[k]), float(sigmas[k])) for k, name in enumerate(group.names)}
+
+
+def _fit_lens(observations: Observations, simple: Adjustment) -> Adjustment:
+    """A pinhole adjustment with the centres, p1, p2 and k3 free, if the views support these parameters."""
+    found = adjust_bundle(observations, simple.unknowns, perspective=True, lens=True)
+    parameters = len(simple.unknowns.cameras) * (LENS.stop - LENS.start)
+    return found if _is_supported(observations, simple, found, parameters) else simple
+
+
+def _fit_board(observations: Observations, simple: Adjustment) -> tuple[Adjustment, float]:
+    """A pinhole adjustment with the points of the board free in its plane, if the views support that.
+
+    Returns:
+        The adjustment, and the RMS distance [m] of the points from where the description puts them; 0 if not supported.
+    """
+    described, names = np.unique(np.round(observations.points, 7), axis=0, return_inverse=True)
+    moved, found = observations, simple
+    lens = bool(simple.unknowns.cameras[:, LENS].any())
+    for _ in range(BOARD_ROUNDS):
+        moved = move_points(moved, found, names.ravel())
+        found = adjust_bundle(moved, found.unknowns, perspective=True, lens=lens)
+    if not _is_supported(observations, simple, found, 2 * len(described) - 6):
+        return simple, 0.0
+    return found, float(np.sqrt(((moved.points - observations.points) ** 2).sum(axis=1).mean()))
+
+
+def _is_supported(observations: Observations, simple: Adjustment, found: Adjustment, parameters: int) -> bool:
+    """Whether Bayes' information criterion (Schwarz, Annals of Statistics 6, 1978) is lower with more parameters."""
+    count = observations.pixels.size
+    gain = 2.0 * count * np.log(simple.robust_rms / max(found.robust_rms, 1e-12))
+    return bool(gain > parameters * np.log(count))
 
 
 def _same_rotations(one: Adjustment, other: Adjustment) -> bool:
@@ -146,10 +197,11 @@ def _choose_solution(
     """
     plausible = _plausible(candidates)
     if len(plausible) > 1:
-        # The perspective of a real lens may resolve an ambiguity of the orthographic model.
+        # The perspective of a real lens may resolve an ambiguity of the orthographic model: only a solution in front of
+        # the camera has a positive distance.
         pinhole = [adjust_bundle(observations, found.unknowns, perspective=True) for found in plausible]
-        best = _plausible(pinhole)
-        if len(best) == 1 and (best[0].unknowns.cameras[:, INVERSE_DISTANCE] > -1e-9).all():
+        best = [found for found in _plausible(pinhole) if not _is_behind(found)]
+        if len(best) == 1:
             plausible = [found for found, other in zip(plausible, pinhole, strict=True) if other is best[0]]
     for camera, name in enumerate(group.names):
         if name in tilt_signs and len(plausible) > 1:
@@ -168,6 +220,13 @@ def _choose_solution(
         f"(distance known) or `moved` (direction known) in board.yaml, or give --tilt-sign {name}=+ if the {edge} edge "
         f"of the board is farther from the camera, {name}=- if it is nearer"
     )
+
+
+def _is_behind(found: Adjustment) -> bool:
+    """Whether perspective shows a board behind a camera: the mirror image of the true solution."""
+    values = found.unknowns.cameras[:, INVERSE_DISTANCE]
+    sigmas = np.sqrt(found.covariance[:, INVERSE_DISTANCE, INVERSE_DISTANCE])
+    return bool((values < -MIN_PERSPECTIVE_SIGMAS * sigmas).any())
 
 
 def _plausible(candidates: list[Adjustment]) -> list[Adjustment]:
@@ -224,9 +283,9 @@ def _build_solution(
                 image_size=group.sizes[k],
                 rotation_vector=vector,
                 focal=tuple(focal.tolist()),
-                centre=tuple(centre.tolist()),
+                centre=tuple((centre + x[11:13]).tolist()),
                 translation=(x[6] / (1e3 * x[0]), x[7] / (1e3 * x[1]), 1.0 / x[INVERSE_DISTANCE]),
-                distortion=(x[8] * ratio**2, x[9] * ratio**4, 0.0, 0.0, 0.0),
+                distortion=tuple((x[[8, 9, 13, 14, 15]] * ratio ** np.array([2, 4, 1, 1, 6])).tolist()),
                 plane=plane,
                 residual=rms,
             )

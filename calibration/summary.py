@@ -54,6 +54,11 @@ def perspective_messages(solution: Solution, depth: float, model: str) -> list[s
                 f"{1e3 * solution.perspective_bias(name, depth):.2f} mm; move the camera farther away and use a longer "
                 "lens, or calibrate with --model pinhole"
             )
+    if solution.board_error:
+        lines.append(
+            f"the printed board is {1e3 * solution.board_error:.3f} mm RMS off its description; the calibration allows "
+            "for it"
+        )
     return lines
 
 

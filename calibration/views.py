@@ -85,8 +85,10 @@ def _nearest_rotation(block: Array, depth: Array) -> Array:
     return rotation
 
 
-def check_views(camera: str, views: list[View]) -> None:
+def check_views(camera: str, views: list[View], model: str) -> None:
     """Check that a camera can be calibrated from its views.
+
+    Tilts matter to the orthographic model. A pinhole camera is determined by perspective, which `solve_rig` checks.
 
     Raises:
         InputError: there are too few views, too few tilted views, or too few directions of tilt.
@@ -94,8 +96,12 @@ def check_views(camera: str, views: list[View]) -> None:
     advice = "tilt the board by 10 to 40 degrees about three directions"
     if len(views) < MIN_VIEWS:
         raise InputError(
-            f"camera {camera}: expected at least {MIN_VIEWS} images that show the board, found {len(views)}; {advice}"
+            f"camera {camera}: expected at least {MIN_VIEWS} images that show the board, found {len(views)}; check the "
+            f"pattern in board.yaml, and {advice}"
         )
+    if model == "pinhole":
+        return
+    advice += ", or calibrate a camera near the board with --model pinhole"
     affines = [fit_affine(view) for view in views]
     tilted = [affine for affine in affines if affine.tilt > MIN_TILT]
     if len(tilted) < MIN_TILT_DIRECTIONS:

@@ -18,8 +18,10 @@ from rich.table import Table
 from threadpoolctl import threadpool_limits
 
 from rafl.calibration.board import read_board
-from rafl.calibration.board_images import board_views, check_shared_world
+from rafl.calibration.board_images import board_views, check_shared_world, image_path
+from rafl.calibration.board_picture import world_view, write_board_picture
 from rafl.calibration.camera import Camera
+from rafl.calibration.detection.image_file import read_grey_image
 from rafl.calibration.foreign.placement import KnownPoints, place_rig
 from rafl.calibration.foreign.read import read_any_calibration
 from rafl.calibration.rest_pose import camera_from_points
@@ -51,7 +53,7 @@ LARGE_RESIDUAL_PX = 0.5
 
 
 def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth: float, out: Path) -> None:
-    """Calibrate a rig from board images, print its cameras and write it.
+    """Calibrate a rig from board images, print its cameras and write it; draw the world beside it for each camera.
 
     Args:
         images: folder with one subfolder of board images per camera.
@@ -80,6 +82,12 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
             )
     for line in perspective_messages(solution, depth, model):
         typer.echo(line)
+    pictures = []
+    for name, camera in solution.rig.cameras.items():
+        view = world_view(views[name])
+        pictures.append(out.with_name(f"{out.stem}-{name}.png"))
+        write_board_picture(pictures[-1], read_grey_image(image_path(images, view.name)), view, camera)
+    typer.echo(f"wrote {', '.join(map(str, pictures))}: check the origin and the axes of the world there")
     _print_next(out)
 
 

@@ -17,7 +17,8 @@ def test_corner_coordinates_are_relative_to_pixel_centres() -> None:
     drawn = PATTERN.opencv_board().generateImage((8 * PIXELS_PER_SQUARE, 5 * PIXELS_PER_SQUARE), marginSize=0)
     enlarged = cv2.resize(drawn, None, fx=1.5, fy=1.5, interpolation=cv2.INTER_CUBIC)
     image = cv2.copyMakeBorder(enlarged, 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=255)
-    points, pixels = PATTERN.find(image)
+    found = PATTERN.find(image)
+    points, pixels = found.points, found.pixels
     assert len(points) == 7 * 4
     expected = 1.5 * PIXELS_PER_SQUARE * points / 0.01 + 19.5
     assert np.abs(pixels - expected).max() < 0.05
@@ -25,8 +26,8 @@ def test_corner_coordinates_are_relative_to_pixel_centres() -> None:
 
 
 def test_image_without_a_board_gives_no_points() -> None:
-    points, pixels = PATTERN.find(np.full((200, 300), 128, np.uint8))
-    assert len(points) == len(pixels) == 0
+    found = PATTERN.find(np.full((200, 300), 128, np.uint8))
+    assert len(found.points) == len(found.pixels) == 0
 
 
 BOARD_FILE = {"format": "rafl-board/1", "pattern": {"kind": "dot-grid", "dots": [9, 6], "spacing_mm": 10}}

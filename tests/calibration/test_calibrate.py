@@ -54,6 +54,13 @@ def test_dot_grid_calibrates_one_camera(dot_grid: Path, run: Run, tmp_path: Path
     assert camera.residual < 0.1
     # The board in the first image is the world frame: its first dot is the origin, at pixel (100, 90).
     assert camera.offset == pytest.approx((100.0, 90.0), abs=0.1)
+    # The axes start there: x is red and runs to the right, y is green and runs down.
+    picture = cv2.imread(str(tmp_path / "calib-grid.png")).astype(int)
+    assert picture.shape == (640, 900, 3)
+    blue, green, red = np.moveaxis(picture, -1, 0)
+    right, down = (red - green > 100) & (red - blue > 100), (green - red > 100) & (green - blue > 100)
+    assert right[90, 160:300].all()
+    assert down[160:250, 100].all()
 
 
 def test_chessboard_calibration_is_checked_on_other_images(run: Run, tmp_path: Path) -> None:
@@ -95,8 +102,8 @@ def test_bad_input_is_refused(dot_grid: Path, run: Run, tmp_path: Path) -> None:
     refused("board.yaml", "found nothing")
     (dot_grid / "board.yaml").write_text(board.replace("dot-grid", "circles"))
     refused("pattern", "circles")
-    (dot_grid / "board.yaml").write_text(board.replace("[9, 6]", "[12, 8]"))
-    refused("camera grid", "at least 4 images")
+    (dot_grid / "board.yaml").write_text(board.replace("[9, 6]", "[8, 6]"))
+    refused(".png", "found one of 9 x 6 points", "correct the pattern")
     world = {"grid/9.png": {"origin_mm": [0, 0, 0], "x_axis": [1, 0, 0], "y_axis": [0, 1, 0]}}
     (dot_grid / "board.yaml").write_text(board + yaml.safe_dump({"world": world}))
     refused("grid/9.png", "not among the images")
@@ -104,8 +111,8 @@ def test_bad_input_is_refused(dot_grid: Path, run: Run, tmp_path: Path) -> None:
     (dot_grid / "3.png").write_bytes(b"not an image")
     refused("3.png", "cannot be read")
     huge = bytearray(cv2.imencode(".bmp", np.zeros((8, 8), np.uint8))[1].tobytes())
-    huge[18:26] = b"\0\0\1\0" * 2  # a header that claims 65536 x 65536 px; OpenCV ignores the file suffix
+    huge[18:26] = b"\0\0\1\0" * 2  # a header that claims 65536 x 65536 px; the file suffix does not matter
     (dot_grid / "3.png").write_bytes(huge)
-    refused("3.png", "cannot be read")
+    refused("3.png", "at most 100 megapixels")
     cv2.imwrite(str(dot_grid / "3.png"), np.zeros((100, 100), np.uint8))
     refused("images of one size", "100 x 100")

@@ -1,0 +1,1 @@
+"""Detection of the points of calibration boards in images."""
