@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rafl.calibration.board import View
 from rafl.calibration.camera import Camera, PinholeCamera
-from rafl.common.files import atomic_file
+from rafl.common.files import write_bytes
 
 Array = NDArray[Any]
 
@@ -71,6 +71,4 @@ def draw_board(image: NDArray[np.uint8], view: View, camera: Camera) -> NDArray[
 
 def write_board_picture(path: Path, image: NDArray[np.uint8], view: View, camera: Camera) -> None:
     """Write `draw_board` as a PNG file, completely or not at all."""
-    content = cv2.imencode(".png", draw_board(image, view, camera))[1].tobytes()
-    with atomic_file(path) as temporary:
-        temporary.write_bytes(content)
+    write_bytes(path, cv2.imencode(".png", draw_board(image, view, camera))[1].tobytes())
