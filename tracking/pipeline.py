@@ -20,7 +20,7 @@ from rafl.tracking.reconstruction.gap_filling import MEASURED, fill_gaps
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels, resample_pixels, shown_frames, triangulate
 from rafl.tracking.video.reader import Video
-from rafl.tracking.video.timestamps import camera_times, common_clock, estimate_clock_delays
+from rafl.tracking.video.timestamps import camera_times, common_clock, estimate_clock_delays, slow_motion_note
 
 Array = NDArray[Any]
 
@@ -91,6 +91,8 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     in_order = {camera: _arrange_columns(item, names[camera], order) for camera, item in followed.items()}
     offsets = {camera: rig.cameras[camera].time_offset for camera in in_order}
     notes = [note for item in followed.values() for note in item.notes]
+    if settings.fps is None:
+        notes += [note for camera, item in followed.items() for note in slow_motion_note(videos[camera], item.time)]
     if settings.sync and len(in_order) > 1:
         offsets = estimate_clock_delays(rig, in_order, times)
         notes += [f"camera {camera}: clock offset {1e3 * s:+.3f} ms, from the motion" for camera, s in offsets.items()]

@@ -22,6 +22,7 @@ from rafl.tracking.video.prefetch import prefetch
 Array = NDArray[Any]
 
 VIDEO_SUFFIXES = {".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mxf", ".mpg", ".mpeg", ".ts"}
+CAPTURE_RATE_TAG = "com.android.capture.fps"  # of QuickTime and MP4 files; other makers' phones write it too
 JPEG_SUFFIXES = {".jpg", ".jpeg"}
 IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".bmp"} | JPEG_SUFFIXES
 
@@ -51,12 +52,15 @@ class Video:
         size: width and height as displayed [px].
         frames: number of frames that the container announces; 0 if it does not.
         fps: frames per second that the container announces; 0 if it does not.
+        capture_fps: frames per second at which the camera recorded a slow-motion file, which plays more slowly; 0 if
+            the file does not say.
     """
 
     path: Path
     size: tuple[int, int]
     frames: int
     fps: float
+    capture_fps: float = 0.0
 
     def read(self) -> Reading:
         """Read every frame in order; a separate thread decodes a few frames in advance.
@@ -118,11 +122,20 @@ def open_video(path: Path) -> Video:
                 raise InputError(f"expected a video in {path}, found {size[0]} x {size[1]} px; export it again")
             if _first_quarter_turns(container, stream) % 2:
                 size = (size[1], size[0])
-            return Video(path, size, frames, fps)
+            return Video(path, size, frames, fps, _capture_fps(container.metadata))
     except (av.FFmpegError, OSError) as error:
         raise InputError(
             f"expected a video in {path}, which cannot be opened ({error}); copy it again from the camera"
         ) from None
+
+
+def _capture_fps(metadata: dict[str, str]) -> float:
+    """Frames per second at which a slow-motion file was recorded; 0 if its tags do not say."""
+    try:
+        rate = float(metadata.get(CAPTURE_RATE_TAG, 0.0))
+    except ValueError:
+        return 0.0
+    return rate if 0.0 < rate < np.inf else 0.0
 
 
 def _first_quarter_turns(container: "av.container.InputContainer", stream: "av.video.stream.VideoStream") -> int:

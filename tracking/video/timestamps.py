@@ -15,6 +15,7 @@ from rafl.tracking.video.reader import Video
 
 Array = NDArray[Any]
 
+SAME_RATE = 0.02  # relative difference of two frame rates that count as equal: containers round them
 MAX_DELAY_FRAMES = 12.0  # between the starts of two cameras
 # The delay with the lowest cost is searched around the MAX_MINIMA lowest samples. The true one may cost up to
 # ACCEPTED_COST_RATIO times the lowest.
@@ -28,9 +29,11 @@ MIN_COMMON_OBSERVATIONS = 20
 def camera_times(times: dict[str, Array], videos: dict[str, Video], fps: float | None) -> dict[str, Array]:
     """Time of every frame by camera [s], from `fps` if given, else from the timestamps.
 
+    The timestamps of a slow-motion file are scaled to the frame rate at which it was recorded.
+
     Args:
         times: timestamps by camera [s], (T).
-        videos: by camera, for messages.
+        videos: by camera.
         fps: frame rate [1/s], or None.
 
     Raises:
@@ -53,16 +56,33 @@ def camera_times(times: dict[str, Array], videos: dict[str, Video], fps: float |
                 f"{path}: expected timestamps that increase with every frame, found {1e3 * time[frame]:.6g} ms at "
                 f"frame {frame}; give the true frame rate with --fps"
             )
-        result[camera] = time
-    rates = {camera: 1.0 / float(np.median(np.diff(time))) for camera, time in result.items()}
+        played, recorded = frame_rate(time), videos[camera].capture_fps
+        result[camera] = time * played / recorded if recorded else time
+    rates = {camera: frame_rate(time) for camera, time in result.items()}
     first, rate = next(iter(rates.items()))
     for camera, other in rates.items():
-        if abs(other / rate - 1.0) > 0.02:
+        if abs(other / rate - 1.0) > SAME_RATE:
             raise InputError(
                 f"{videos[camera].path}: expected {rate:.6g} frames/s as in camera {first}, found {other:.6g}; record "
                 "all cameras at one frame rate, or give the true one with --fps"
             )
     return result
+
+
+def frame_rate(time: Array) -> float:
+    """Frames per second of times (T) [s]."""
+    return 1.0 / float(np.median(np.diff(time)))
+
+
+def slow_motion_note(video: Video, time: Array) -> list[str]:
+    """A note on a video whose timestamps (T) [s] play it more slowly than it was recorded, if they do."""
+    played, recorded = frame_rate(time), video.capture_fps
+    if not recorded or abs(played / recorded - 1.0) < SAME_RATE:
+        return []
+    return [
+        f"{video.path.name}: plays at {played:.6g} frames/s and was recorded at {recorded:.6g}, as its capture-rate tag "
+        "says; the times are those of the recording"
+    ]
 
 
 def common_clock(times: dict[str, Array]) -> Array:

@@ -316,3 +316,17 @@ def test_stopping_early_leaves_no_thread(tmp_path: Path) -> None:
     next(frames)
     frames.close()
     assert threading.active_count() == before
+
+
+@pytest.mark.parametrize(("tag", "rate"), [("240.000000", 240.0), ("nan", 0.0), ("fast", 0.0), (None, 0.0)])
+def test_capture_rate_of_slow_motion_files(tmp_path: Path, tag: str | None, rate: float) -> None:
+    path = tmp_path / "a.mov"
+    with av.open(str(path), "w", options={"movflags": "use_metadata_tags"}) as container:
+        if tag is not None:
+            container.metadata["com.android.capture.fps"] = tag
+        stream = container.add_stream("mjpeg", rate=30)
+        stream.width, stream.height, stream.pix_fmt = 96, 64, "yuvj420p"
+        image = np.zeros((64, 96, 3), np.uint8)
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(image, format="rgb24")))
+        container.mux(stream.encode(None))
+    assert open_video(path).capture_fps == rate

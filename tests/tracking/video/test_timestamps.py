@@ -9,7 +9,7 @@ from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
 from rafl.tracking.reconstruction.triangulation import CameraPixels, shown_frames
 from rafl.tracking.video.reader import Video
-from rafl.tracking.video.timestamps import camera_times, common_clock, estimate_clock_delays
+from rafl.tracking.video.timestamps import camera_times, common_clock, estimate_clock_delays, slow_motion_note
 
 SIDE = OrthographicCamera(
     image_size=(1280, 720), scale=(6000.0, 6000.0), rotation_vector=(np.pi / 2, 0.0, 0.0), offset=(600.0, 400.0)
@@ -79,3 +79,17 @@ def test_decreasing_times_and_differing_rates_are_refused() -> None:
     with pytest.raises(InputError, match=r"b\.mp4.*100 frames/s.*found 50"):
         camera_times({"a": TIME, "b": 2 * TIME}, videos, None)
     assert camera_times({"a": decreasing, "b": TIME}, videos, 50.0)["a"][-1] == pytest.approx(119 / 50)
+
+
+def test_slow_motion_is_timed_by_its_capture_rate() -> None:
+    """A film of 100 frames/s that plays at 30, beside one that plays at the rate at which it was recorded."""
+    slow = Video(Path("a.mov"), (1280, 720), 120, 30.0, 100.0)
+    videos = {"a": slow, "b": replace(slow, path=Path("b.mov"), fps=100.0)}
+    played = np.arange(120) / 30.0
+    times = camera_times({"a": played, "b": TIME}, videos, None)
+    np.testing.assert_allclose(times["a"], TIME)
+    np.testing.assert_allclose(times["b"], TIME)
+    (note,) = slow_motion_note(slow, played)
+    assert note.startswith("a.mov: plays at 30 frames/s and was recorded at 100")
+    assert slow_motion_note(videos["b"], TIME) == []
+    assert slow_motion_note(replace(slow, capture_fps=0.0), played) == []
