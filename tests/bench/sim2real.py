@@ -339,7 +339,7 @@ def main() -> None:
 def run_study(study: Study, results: Path) -> None:
     """Compute what is missing of a study; print and write its tables."""
     print(f"laboratory {study.lab}", flush=True)
-    suffix = "" if study.lab == LABS[0] else f"-{study.lab}"
+    suffix = f"-{study.lab}"
     for shape in study.shapes:
         study.build_dataset(shape)
         study.fit(shape)

@@ -80,8 +80,8 @@ def slow_motion_note(video: Video, time: Array) -> list[str]:
     if not recorded or abs(played / recorded - 1.0) < SAME_RATE:
         return []
     return [
-        f"{video.path.name}: plays at {played:.6g} frames/s and was recorded at {recorded:.6g}, as its capture-rate tag "
-        "says; the times are those of the recording"
+        f"{video.path.name}: plays at {played:.6g} frames/s and was recorded at {recorded:.6g}, says its capture-rate "
+        "tag; the times are those of the recording"
     ]
 
 
