@@ -64,8 +64,8 @@ def draw_board(image: NDArray[np.uint8], view: View, camera: Camera) -> NDArray[
         cv2.drawMarker(canvas, corner, ORIGIN_COLOUR, cv2.MARKER_TILTED_CROSS, 12 * width, 2 * width, cv2.LINE_AA)
         label("board origin", (corner[0] + 8 * width, corner[1] + 14 * width), ORIGIN_COLOUR)
     lines = [f"{view.name}: {len(view.points)} points", f"axes of the world, {1e3 * length:.0f} mm"]
-    for number, text in enumerate(lines):
-        label(text, (8 * width, (number + 1) * 16 * width), (255, 255, 255))
+    for number, text in enumerate(reversed(lines)):
+        label(text, (8 * width, canvas.shape[0] - (number + 1) * 16 * width), (255, 255, 255))
     return np.asarray(canvas, dtype=np.uint8)
 
 

@@ -104,7 +104,7 @@ def _row(name: str, dataset: Dataset) -> list[object]:
         "moving" if values["initial"] == "moving" else "at rest",
         values["still_frames"],
         values["registration"],
-        f"{values['registration_residual_mm']:.3f}",
+        _measured(float(str(values["registration_residual_mm"])), ".3f"),
         f"{values['fit_residual_mm']:.3f}",
     ]
 
@@ -113,7 +113,12 @@ def _moduli(name: str, values: dict[str, object]) -> list[str]:
     """Row of the table of moduli; a dash where one cannot be measured."""
     numbers = [float(str(values[key])) for key in ("bend_modulus", "swing_modulus", "swing_hz")]
     scaled = [1e-3 * numbers[0], 1e-3 * numbers[1], numbers[2]]
-    return [name, *(f"{value:.3g}" if np.isfinite(value) else "-" for value in scaled)]
+    return [name, *(_measured(value, ".3g") for value in scaled)]
+
+
+def _measured(value: float, format_spec: str) -> str:
+    """A number, or a dash where nothing was measured."""
+    return format(value, format_spec) if np.isfinite(value) else "-"
 
 
 def _places(markers: Markers) -> list[list[str]]:

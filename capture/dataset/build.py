@@ -322,7 +322,7 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, setting
             "registration_R": pose.rotation.reshape(-1, 3, 3)[0],
             "registration_t": pose.translation.reshape(-1, 3)[0],
             "registration_covariance": registration.covariance,
-            "registration_residual_mm": 1e3 * max(registration.residual.values(), default=0.0),
+            "registration_residual_mm": 1e3 * max(registration.residual.values(), default=np.nan),
             "registration_markers": ", ".join(f"{k} {1e3 * v:.3f}" for k, v in registration.residual.items()),
             "registration_modulus": registration.modulus,
             "registration_modulus_sigma": registration.modulus_sigma,

@@ -45,7 +45,7 @@ def recordings_table(dataset: Dataset) -> Table:
 
 
 def _number(value: object, format_spec: str) -> str:
-    return format(value, format_spec) if isinstance(value, (int, float)) else "-"
+    return format(value, format_spec) if isinstance(value, (int, float)) and np.isfinite(value) else "-"
 
 
 def warnings(dataset: Dataset) -> list[str]:
