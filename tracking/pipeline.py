@@ -20,7 +20,13 @@ from rafl.tracking.reconstruction.gap_filling import MEASURED, fill_gaps
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels, resample_pixels, shown_frames, triangulate
 from rafl.tracking.video.reader import Video
-from rafl.tracking.video.timestamps import camera_times, common_clock, estimate_clock_delays, slow_motion_note
+from rafl.tracking.video.timestamps import (
+    camera_times,
+    common_clock,
+    estimate_clock_delays,
+    late_starts,
+    slow_motion_note,
+)
 
 Array = NDArray[Any]
 
@@ -96,6 +102,9 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     if settings.sync and len(in_order) > 1:
         offsets = estimate_clock_delays(rig, in_order, times)
         notes += [f"camera {camera}: clock offset {1e3 * s:+.3f} ms, from the motion" for camera, s in offsets.items()]
+    elif len({len(time) for time in times.values()}) > 1:
+        offsets, remarks = late_starts(rig, in_order, times)
+        notes += remarks
     rig_times = {camera: time - offsets[camera] for camera, time in times.items()}
     clock = common_clock(rig_times)
     frame = {camera: shown_frames(time, clock) for camera, time in rig_times.items()}

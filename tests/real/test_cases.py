@@ -113,6 +113,13 @@ def test_slow_motion(run: Run, tmp_path: Path) -> None:
         assert file.attrs["fps"] == pytest.approx(100.0)
 
 
+def test_a_camera_that_began_later(run: Run) -> None:
+    videos = CASES / "video-late-camera" / "videos"
+    result = run("rafl-track", videos, "--calib", CALIB, "--specimen", SPECIMEN, "--out", "tracks")
+    assert result.returncode == 0, result.stderr
+    assert "right began 5.0 frames later" in result.stdout
+
+
 def test_one_unreadable_video(run: Run, tmp_path: Path) -> None:
     shutil.copytree(CASES / "one-unreadable-video" / "v", tmp_path / "v")
     result = run("rafl-track", "v", "--calib", SEED / "calib.yaml", "--out", "tracks")

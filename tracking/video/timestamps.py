@@ -16,6 +16,7 @@ from rafl.tracking.video.reader import Video
 Array = NDArray[Any]
 
 SAME_RATE = 0.02  # relative difference of two frame rates that count as equal: containers round them
+LEAST_DELAY_FRAMES = 0.5  # of a camera that began at another frame than the others
 MAX_DELAY_FRAMES = 12.0  # between the starts of two cameras
 # The delay with the lowest cost is searched around the MAX_MINIMA lowest samples. The true one may cost up to
 # ACCEPTED_COST_RATIO times the lowest.
@@ -139,6 +140,37 @@ def estimate_clock_delays(rig: Rig, pixels: dict[str, CameraPixels], times: dict
         accepted_cost = ACCEPTED_COST_RATIO * min(minimum.fun for minimum in minima) + 1e-9
         result[other] = min((float(minimum.x) for minimum in minima if minimum.fun < accepted_cost), key=abs)
     return result
+
+
+def late_starts(
+    rig: Rig, pixels: dict[str, CameraPixels], times: dict[str, Array]
+) -> tuple[dict[str, float], list[str]]:
+    """Time offsets of cameras [s] that recorded different numbers of frames, and notes.
+
+    A camera that stopped earlier than the others has the offset of its calibration. One that began a frame or more
+    later has, in addition, the delay that the motion shows; a smaller delay could be an error of its estimate.
+
+    Args:
+        rig: the calibrated cameras.
+        pixels: markers by camera, in the same order in all.
+        times: by camera [s].
+    """
+    offsets = {camera: rig.cameras[camera].time_offset for camera in pixels}
+    first = next(iter(pixels))
+    counts = "the cameras recorded " + ", ".join(f"{len(times[camera])} ({camera})" for camera in pixels) + " frames"
+    try:
+        found = estimate_clock_delays(rig, pixels, times)
+    except InputError:
+        return offsets, [f"{counts}; whether they began together, the motion does not show"]
+    notes = []
+    for camera, relative in found.items():
+        offset = offsets[first] + relative
+        frames = (offset - offsets[camera]) * frame_rate(times[camera])
+        if abs(frames) > LEAST_DELAY_FRAMES:
+            offsets[camera] = offset
+            order = "later" if frames < 0.0 else "earlier"
+            notes.append(f"{counts}; by the motion, {camera} began {abs(frames):.1f} frames {order}: corrected")
+    return offsets, notes
 
 
 def _reprojection_cost(

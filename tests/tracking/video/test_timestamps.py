@@ -9,7 +9,13 @@ from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
 from rafl.tracking.reconstruction.triangulation import CameraPixels, shown_frames
 from rafl.tracking.video.reader import Video
-from rafl.tracking.video.timestamps import camera_times, common_clock, estimate_clock_delays, slow_motion_note
+from rafl.tracking.video.timestamps import (
+    camera_times,
+    common_clock,
+    estimate_clock_delays,
+    late_starts,
+    slow_motion_note,
+)
 
 SIDE = OrthographicCamera(
     image_size=(1280, 720), scale=(6000.0, 6000.0), rotation_vector=(np.pi / 2, 0.0, 0.0), offset=(600.0, 400.0)
@@ -50,6 +56,23 @@ def test_delays_without_common_markers(random: np.random.Generator) -> None:
         pixels[name].pixel[:, hidden] = np.nan
         pixels[name].sigma[:, hidden] = np.nan
     assert estimate_clock_delays(RIG, pixels, {"side": TIME, "askew": TIME})["askew"] == pytest.approx(0.0237, abs=1e-3)
+
+
+def test_a_camera_that_began_later_is_found_by_its_missing_frames(random: np.random.Generator) -> None:
+    pixels = {"side": project_with_noise(SIDE, TIME, random), "askew": project_with_noise(ASKEW, TIME[5:], random)}
+    offsets, (note,) = late_starts(RIG, pixels, {"side": TIME, "askew": TIME[:-5]})
+    assert offsets == {"side": 0.0, "askew": pytest.approx(-0.05, abs=2e-4)}
+    assert note.startswith("the cameras recorded 120 (side), 115 (askew) frames;")
+    assert note.endswith("by the motion, askew began 5.0 frames later: corrected")
+
+
+def test_a_camera_that_stopped_earlier_keeps_its_offset(random: np.random.Generator) -> None:
+    pixels = {"side": project_with_noise(SIDE, TIME, random), "askew": project_with_noise(ASKEW, TIME[:-5], random)}
+    assert late_starts(RIG, pixels, {"side": TIME, "askew": TIME[:-5]}) == ({"side": 0.0, "askew": 0.0}, [])
+    still = {name: CameraPixels(0.0 * item.pixel + 400.0, item.sigma) for name, item in pixels.items()}
+    offsets, (note,) = late_starts(RIG, still, {"side": TIME, "askew": TIME[:-5]})
+    assert offsets == {"side": 0.0, "askew": 0.0}
+    assert note.endswith("whether they began together, the motion does not show")
 
 
 def test_delay_without_motion_is_an_error(random: np.random.Generator) -> None:
