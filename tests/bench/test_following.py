@@ -18,6 +18,7 @@ def restore_generator(state: int, increment: int, spare: int | None = None) -> n
     return random
 
 
+@pytest.mark.slow
 def test_uncertain_velocity_does_not_change_identities(monkeypatch: pytest.MonkeyPatch) -> None:
     """A passing bar leaves two of ten markers visible; the others were predicted to within seven spacings only.
 
