@@ -116,6 +116,10 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         raise InputError(
             f"expected at least {MIN_MARKERS} markers, tracked {measured}; check the lighting and the calibration"
         )
+    if settings.layout is not None:
+        seen = {name for name, known in zip(order, (state == MEASURED).any(axis=0), strict=True) if known}
+        if lost := [name for name in settings.layout.names if name not in seen]:
+            notes.append(f"markers {', '.join(lost)} of the specimen were never found")
     for camera, item in followed.items():
         damaged = np.flatnonzero(item.damaged)
         if len(damaged):

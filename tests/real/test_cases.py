@@ -113,6 +113,15 @@ def test_slow_motion(run: Run, tmp_path: Path) -> None:
         assert file.attrs["fps"] == pytest.approx(100.0)
 
 
+def test_a_marker_that_is_never_found_is_named(run: Run, tmp_path: Path) -> None:
+    text = SPECIMEN.read_text(encoding="utf-8") + "  - {name: absent, at_mm: [50, 0, 27]}\n"
+    (tmp_path / "specimen.yaml").write_text(text, encoding="utf-8")
+    videos = CASES / "video-capture-rate-tag" / "videos"
+    result = run("rafl-track", videos, "--calib", CALIB, "--specimen", "specimen.yaml", "--out", "tracks")
+    assert result.returncode == 0, result.stderr
+    assert "markers absent of the specimen were never found" in result.stdout
+
+
 def test_a_camera_that_began_later(run: Run) -> None:
     videos = CASES / "video-late-camera" / "videos"
     result = run("rafl-track", videos, "--calib", CALIB, "--specimen", SPECIMEN, "--out", "tracks")
