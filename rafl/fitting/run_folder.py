@@ -258,6 +258,8 @@ def _is_time_integration(content: Any) -> bool:
     """Whether some content has the form of `Simulator.time_integration`."""
     if not (isinstance(content, dict) and set(content) == {"integrator", "substeps"}):
         return False
+    if not isinstance(content["integrator"], str):
+        return False
     return content["integrator"] in INTEGRATORS and isinstance(content["substeps"], int) and content["substeps"] >= 1
 
 
