@@ -80,13 +80,17 @@ class Camera:
         raise NotImplementedError
 
     def undistort(self, pixels: Array) -> Array:
-        """Undistorted pixels (..., 2): the inverse of `distort`, by fixed-point iteration."""
+        """Undistorted pixels (..., 2): the inverse of `distort`, by fixed-point iteration.
+
+        Where a distortion is so strong that the iteration diverges, they are not finite.
+        """
         undistorted = pixels.copy()
-        for _ in range(40):
-            error = pixels - self.distort(undistorted)
-            undistorted += error
-            if not np.nanmax(np.abs(error), initial=0.0) > 1e-10:
-                break
+        with np.errstate(over="ignore", invalid="ignore"):
+            for _ in range(40):
+                error = pixels - self.distort(undistorted)
+                undistorted += error
+                if not np.nanmax(np.abs(error), initial=0.0) > 1e-10:
+                    break
         return undistorted
 
     def project(self, points: Array) -> Array:

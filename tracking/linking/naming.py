@@ -119,8 +119,8 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, source: st
     markers, pixels = visible_markers(layout, camera), camera.undistort(dots)
     if not np.isfinite(pixels).all():
         raise InputError(
-            f"{source}: expected a calibration whose distortion can be removed from every dot, found one that sends dots "
-            "to infinity; check calib.yaml"
+            f"{source}: expected a calibration whose distortion can be removed from every dot, found one that sends "
+            "dots to infinity; check calib.yaml"
         )
     names = _match_layout(pixels, layout, camera, markers)
     if len(dots) > len(markers):  # static dots, a hollow body, or spheres on stands that are visible from behind
