@@ -1,6 +1,5 @@
 """A picture that shows where a calibration puts the world: the points found on the board, and the world's axes."""
 
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,7 +8,6 @@ from numpy.typing import NDArray
 
 from rafl.calibration.board import View
 from rafl.calibration.camera import Camera, PinholeCamera
-from rafl.common.files import write_bytes
 
 Array = NDArray[Any]
 
@@ -69,6 +67,6 @@ def draw_board(image: NDArray[np.uint8], view: View, camera: Camera) -> NDArray[
     return np.asarray(canvas, dtype=np.uint8)
 
 
-def write_board_picture(path: Path, image: NDArray[np.uint8], view: View, camera: Camera) -> None:
-    """Write `draw_board` as a PNG file, completely or not at all."""
-    write_bytes(path, cv2.imencode(".png", draw_board(image, view, camera))[1].tobytes())
+def board_picture(image: NDArray[np.uint8], view: View, camera: Camera) -> bytes:
+    """`draw_board` as a PNG file."""
+    return bytes(cv2.imencode(".png", draw_board(image, view, camera))[1].tobytes())

@@ -10,16 +10,16 @@ import torch
 import typer
 from rich.console import Console
 
-from rafl.capture.dataset.build import CaptureSettings as CaptureSettings
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.naming import read_marker_names as read_marker_names
+from rafl.capture.dataset.settings import CaptureSettings as CaptureSettings
 from rafl.capture.dataset.sources import read_recording
 from rafl.capture.dataset.summary import print_contents, recordings_table, warnings
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
 from rafl.capture.description.describe import Description, describe
-from rafl.capture.description.drawing import write_drawing
+from rafl.capture.description.drawing import draw_description
 from rafl.capture.description.specimen_text import body_like, body_of_box, body_of_surface, specimen_text
-from rafl.capture.description.stencil import design_stencil, write_stencil
+from rafl.capture.description.stencil import design_stencil, stencil_pdf
 from rafl.capture.registration.places import MODULUS_SIGMA
 from rafl.capture.registration.registration import RestPose as RestPose
 from rafl.capture.rendering.film import ENCODINGS, render_video, side_cameras, write_board_images, write_truth
@@ -29,7 +29,7 @@ from rafl.capture.report import dataset_page
 from rafl.capture.specimen.specimen import Body, Specimen, read_specimen
 from rafl.common.command_line import progress
 from rafl.common.errors import InputError, SimulationError
-from rafl.common.files import new_content, require_writable, write_text, written_texts
+from rafl.common.files import new_content, require_writable, write_text, written_files
 from rafl.common.kernels import announce_compilation
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
@@ -197,8 +197,10 @@ def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str |
         "clamp": "To check: the face that is held, and the face on which loads hang.",
         "markers": "Places on the undeformed body. A place that you measured better replaces the one found here.",
     }
-    write_drawing(out.with_suffix(".png"), found, f"{body.name}, from {still.name}")
-    write_text(out, specimen_text(body.with_modulus(found.youngs_modulus), markers, remarks))
+    drawing = draw_description(found, f"{body.name}, from {still.name}")
+    text = specimen_text(body.with_modulus(found.youngs_modulus), markers, remarks)
+    with written_files({out.with_suffix(".png"): drawing, out: text}):
+        pass
     for name, distance in found.left_out.items():
         typer.echo(
             f"warning: dot {name} lies {1e3 * distance:.1f} mm off every face and was left out; if it is on the "
@@ -234,9 +236,9 @@ def stencil(size_mm: tuple[float, float, float], dot_mm: float, out: Path) -> No
         "material": "To check: all of it is assumed.",
         "clamp": "To check: the face that is held, and the face on which loads hang.",
     }
-    write_stencil(out, layout)
     entries = [item.model_dump(exclude_unset=True, mode="json") for item in layout.markers]
-    write_text(description, specimen_text(body, entries, remarks))
+    with written_files({out: stencil_pdf(layout), description: specimen_text(body, entries, remarks)}):
+        pass
     count = sum(len(item.markers()) for item in layout.markers)
     typer.echo(f"wrote {out} ({count} dots of {dot_mm:g} mm) and {description}")
     typer.echo("next: print at 100 %, measure the scale bar, put the dots on the specimen, and film it")
@@ -264,7 +266,7 @@ def capture(
     known = read_dataset(path).markers if update else None
     dataset = _built(described, tracks, rows, settings, recordings, known)
     report = path.with_suffix(".html")
-    with written_texts({report: dataset_page(described, dataset)}):
+    with written_files({report: dataset_page(described, dataset)}):
         (update_dataset if update else write_dataset)(path, dataset)
     Console(width=130).print(recordings_table(dataset))
     for line in warnings(dataset):

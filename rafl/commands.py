@@ -15,7 +15,7 @@ from rich.table import Table
 
 from rafl.common.command_line import create_table, progress
 from rafl.common.errors import InputError, SimulationError
-from rafl.common.files import require_writable, written_texts
+from rafl.common.files import require_writable, written_files
 from rafl.common.kernels import announce_compilation
 from rafl.common.names import require_names
 from rafl.common.text_tables import spreadsheet_text
@@ -197,7 +197,7 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
     if transfer.errors.shape[1] > 1:
         errors = transfer.errors.rename(index=spreadsheet_text, columns=spreadsheet_text)
         texts["transfer.csv"] = errors.to_csv(float_format="%.6f")
-    with written_texts({folder / name: text for name, text in texts.items()}):
+    with written_files({folder / name: text for name, text in texts.items()}):
         pass
     Console(width=100).print(_error_table(splits))
     for sentence in beyond_training(comparisons, models):

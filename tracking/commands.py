@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from rafl.calibration.board import read_board
 from rafl.calibration.board_images import board_views, check_shared_world, image_path
-from rafl.calibration.board_picture import world_view, write_board_picture
+from rafl.calibration.board_picture import board_picture, world_view
 from rafl.calibration.camera import Camera
 from rafl.calibration.detection.image_file import read_grey_image
 from rafl.calibration.foreign.placement import KnownPoints, place_rig
@@ -31,7 +31,7 @@ from rafl.calibration.summary import camera_table, check_table, perspective_mess
 from rafl.calibration.validation import check_view, write_residual_plot
 from rafl.common.command_line import create_table, progress
 from rafl.common.errors import InputError
-from rafl.common.files import require_writable
+from rafl.common.files import require_writable, written_files
 from rafl.common.kernels import announce_compilation
 from rafl.tracking.linking.layout import read_layout
 from rafl.tracking.linking.naming import with_face_planes
@@ -71,7 +71,15 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
     views, sizes = board_views(images, description)
     check_shared_world(views)
     solution = solve_rig(views, sizes, description, _tilt_signs(tilt_sign, list(views)), model)
-    write_calibration(out, solution.rig)
+    shown = {name: world_view(own) for name, own in views.items()}
+    pictures = {
+        out.with_name(f"{out.stem}-{name}.png"): board_picture(
+            read_grey_image(image_path(images, shown[name].name)), shown[name], camera
+        )
+        for name, camera in solution.rig.cameras.items()
+    }
+    with written_files(pictures):
+        write_calibration(out, solution.rig)
     Console(width=110).print(camera_table(solution, views))
     for name, camera in solution.rig.cameras.items():
         if camera.residual > LARGE_RESIDUAL_PX:
@@ -82,11 +90,6 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
             )
     for line in perspective_messages(solution, depth, model):
         typer.echo(line)
-    pictures = []
-    for name, camera in solution.rig.cameras.items():
-        view = world_view(views[name])
-        pictures.append(out.with_name(f"{out.stem}-{name}.png"))
-        write_board_picture(pictures[-1], read_grey_image(image_path(images, view.name)), view, camera)
     typer.echo(f"wrote {', '.join(map(str, pictures))}: check the origin and the axes of the world there")
     _print_next(out)
 

@@ -1,6 +1,6 @@
 """Picture of a description: the dots on each face of the body, as recorded and carried back."""
 
-from pathlib import Path
+import io
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,15 +8,14 @@ from matplotlib.collections import LineCollection, PolyCollection
 
 from rafl.capture.description.describe import Description
 from rafl.capture.description.naming import LETTERS, on_face
-from rafl.common.files import atomic_file
 
 VIEWS = {"y-min": "left", "y-max": "right", "z-max": "top", "z-min": "bottom", "x-max": "tip", "x-min": "clamp"}
 WIDTH_IN = 9.0  # of the picture
 NAME_OFFSET_PT = (3.0, 3.0)  # from a dot to its name
 
 
-def write_drawing(path: Path, description: Description, title: str) -> None:
-    """Draw every face that has dots (PNG): the undeformed body with the dots named, and the body as recorded."""
+def draw_description(description: Description, title: str) -> bytes:
+    """A PNG file of every face that has dots: the undeformed body with the dots named, and the body as recorded."""
     plt.switch_backend("agg")
     mesh, found = description.shape.mesh, description.undeformed
     faces = np.array(description.faces)
@@ -44,14 +43,18 @@ def write_drawing(path: Path, description: Description, title: str) -> None:
         axes.plot(*recorded.T, "o", markersize=2.5, color="#c0392b")
         axes.plot(*rest.T, "o", markersize=4, color="#1f4e79")
         for dot, place in zip(np.flatnonzero(own), rest, strict=True):
-            axes.annotate(description.names[dot], place, xytext=NAME_OFFSET_PT, textcoords="offset points", fontsize=7)
+            name = description.names[dot]
+            axes.annotate(name, place, xytext=NAME_OFFSET_PT, textcoords="offset points", fontsize=7, parse_math=False)
         along, across = ("y", "z") if face[0] == "x" else ("x", "z") if face[0] == "y" else ("x", "y")
         # Rows of side faces and ends go down, along -z.
         axes.yaxis.set_major_formatter(lambda value, _, down=across == "z": f"{-value + 0.0 if down else value:g}")
         axes.set(aspect="equal", xlabel=f"{along} [mm]", ylabel=f"{across} [mm]", title=f"{VIEWS[face]} ({face})")
         axes.autoscale_view()
         axes.invert_yaxis()
-    figure.suptitle(f"{title}\nblue: undeformed, with the places of the dots; red: as recorded", fontsize=9)
-    with atomic_file(path) as temporary:
-        figure.savefig(temporary, dpi=130)
+    figure.suptitle(
+        f"{title}\nblue: undeformed, with the places of the dots; red: as recorded", fontsize=9, parse_math=False
+    )
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=130)
     plt.close(figure)
+    return file.getvalue()

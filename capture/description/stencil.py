@@ -1,7 +1,7 @@
 """A layout of dots for a box, drawn to scale as a sheet that wraps around it."""
 
+import io
 from dataclasses import dataclass
-from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 from rafl.common.errors import InputError
-from rafl.common.files import atomic_file
 from rafl.tracking.linking.layout import MarkerEntry, MarkerGrid
 
 # Lengths in dot diameters. Detection wants about four between neighbours, and dots away from edges; jaws hide what is
@@ -110,9 +109,11 @@ _CAPTION = (
 )
 
 
-def write_stencil(path: Path, stencil: Stencil) -> None:
-    """Write the sheet as a PDF file."""
+def stencil_pdf(stencil: Stencil) -> bytes:
+    """The sheet as a PDF file."""
     plt.switch_backend("agg")
     figure = draw_stencil(stencil)
-    with atomic_file(path) as temporary:
-        figure.savefig(temporary, format="pdf")
+    file = io.BytesIO()
+    figure.savefig(file, format="pdf")
+    plt.close(figure)
+    return file.getvalue()

@@ -137,7 +137,7 @@ def _written_file(path: Path, content: bytes | memoryview, read_back: ReadBack |
 
 
 @contextmanager
-def written_texts(texts: Mapping[Path, str]) -> Iterator[None]:
+def written_files(contents: Mapping[Path, bytes | str]) -> Iterator[None]:
     """Files that are written now, and take their places together when the context ends without an error.
 
     Raises:
@@ -145,8 +145,9 @@ def written_texts(texts: Mapping[Path, str]) -> Iterator[None]:
         OSError: likewise.
     """
     with ExitStack() as stack:
-        for path, text in texts.items():
-            stack.enter_context(_written_file(path, _encoded(text)))
+        for path, content in contents.items():
+            data = _encoded(content) if isinstance(content, str) else content
+            stack.enter_context(_written_file(path, data))
         yield
 
 

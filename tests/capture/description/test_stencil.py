@@ -1,12 +1,11 @@
 """The layout of dots to print, and its scale."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from rafl.capture.description.stencil import SCALE_BAR_MM, design_stencil, draw_stencil, write_stencil
+from rafl.capture.description.stencil import SCALE_BAR_MM, design_stencil, draw_stencil, stencil_pdf
 from rafl.common.errors import InputError
 from rafl.tracking.linking.layout import MarkerLayout
 
@@ -30,15 +29,14 @@ def test_dots_are_apart_off_the_edges_and_unlike_their_mirror_image(size: tuple[
 
 
 @pytest.mark.parametrize(("size", "dot"), SIZES)
-def test_the_page_is_to_scale(size: tuple[float, ...], dot: float, tmp_path: Path) -> None:
+def test_the_page_is_to_scale(size: tuple[float, ...], dot: float) -> None:
     stencil = design_stencil(size, dot)
     figure = draw_stencil(stencil)
     (axes,) = figure.axes
     (bar,) = (line for line in axes.lines if line.get_gid() == "scale")
     ends = axes.transData.transform(bar.get_xydata()) / figure.dpi * 25.4  # [mm] on paper
     assert np.ptp(ends[:, 0]) == pytest.approx(SCALE_BAR_MM, abs=1e-6)
-    write_stencil(tmp_path / "s.pdf", stencil)
-    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", (tmp_path / "s.pdf").read_bytes())
+    box = re.search(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", stencil_pdf(stencil))
     assert box is not None
     np.testing.assert_allclose(np.array(box.groups(), dtype=float) / 72.0, figure.get_size_inches(), rtol=1e-4)
 

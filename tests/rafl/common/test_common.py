@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import pytest
 
 from rafl.common.errors import InputError
-from rafl.common.files import atomic_file, new_content, require_writable, sha256, write_bytes, written_texts
+from rafl.common.files import atomic_file, new_content, require_writable, sha256, write_bytes, written_files
 from rafl.common.yaml_files import StrictModel, check_format, read_yaml
 
 
@@ -56,13 +56,13 @@ def test_full_disk_is_told_with_what_was_needed(tmp_path: Path, monkeypatch: pyt
 def test_files_take_their_places_together(tmp_path: Path) -> None:
     old, new, folder = tmp_path / "a.csv", tmp_path / "out" / "b.csv", tmp_path / "c.csv"
     old.write_text("old")
-    with written_texts({old: "new", new: "new"}):
+    with written_files({old: "new", new: "new"}):
         assert old.read_text() == "old"
     assert (old.read_text(), new.read_text()) == ("new", "new")
     folder.mkdir()
-    with pytest.raises(InputError, match="found a folder"), written_texts({old: "newer", folder: "newer"}):
+    with pytest.raises(InputError, match="found a folder"), written_files({old: "newer", folder: "newer"}):
         pass
-    with pytest.raises(ZeroDivisionError), written_texts({old: "newer", tmp_path / "more" / "d.csv": "newer"}):
+    with pytest.raises(ZeroDivisionError), written_files({old: "newer", tmp_path / "more" / "d.csv": "newer"}):
         raise ZeroDivisionError
     assert old.read_text() == "new"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.csv", "c.csv", "out"]
