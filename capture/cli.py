@@ -11,6 +11,7 @@ import typer
 from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
+from rafl.common.units import Unit
 
 SPECIMEN = "a specimen description (specimen.yaml)"
 
@@ -32,14 +33,6 @@ class Codec(StrEnum):
     h264 = "h264"
     ffv1 = "ffv1"
     mjpeg = "mjpeg"
-
-
-class Unit(StrEnum):
-    """Unit of positions."""
-
-    m = "m"
-    cm = "cm"
-    mm = "mm"
 
 
 @render_app.command()

@@ -8,16 +8,15 @@ import typer
 from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file, require_folder
+from rafl.common.units import Unit
 
 CAMERA_MODELS = ("orthographic", "pinhole")
 EXPORT_FORMATS = ("csv", "c3d", "trc", "npy")
-LENGTH_UNITS = ("mm", "cm", "m")
 CALIBRATION_LABEL = "a calibration (calib.yaml, written by rafl-calibrate, or one of another program)"
 SPECIMEN_LABEL = "a specimen description (specimen.yaml)"
 
 CalibUnit = Annotated[
-    str | None,
-    typer.Option(help="Unit of the lengths in a calibration of another program that does not state it: mm, cm or m."),
+    Unit | None, typer.Option(help="Unit of the lengths in a calibration of another program that does not state it.")
 ]
 
 calibrate_app = create_app("Calibrate cameras.")
@@ -85,7 +84,7 @@ def calibrate(
         if calib is not None:
             if tilt_sign:
                 raise InputError("--calib: expected no --tilt-sign, which perspective tells; leave it out")
-            _check_calibration(calib, calib_unit)
+            _check_calibration(calib)
         elif calib_unit:
             raise InputError("expected --calib-unit with --calib or --check only; leave it out")
         from rafl.tracking import commands
@@ -101,7 +100,7 @@ def calibrate(
     require_folder(images, "a folder of board images")
     board = require_file(board or images / "board.yaml", "a board description (board.yaml)")
     if check is not None:
-        _check_calibration(check, calib_unit)
+        _check_calibration(check)
     elif calib_unit:
         raise InputError("expected --calib-unit with --calib or --check only; leave it out")
     from rafl.tracking import commands
@@ -112,12 +111,10 @@ def calibrate(
         commands.calibrate(images, board, model, tilt_sign or [], 1e-3 * depth_mm, out)
 
 
-def _check_calibration(path: Path, unit: str | None) -> None:
-    """Refuse a calibration that is not there, and a unit that is none."""
+def _check_calibration(path: Path) -> None:
+    """Refuse a calibration that is not there."""
     if not path.is_dir():  # a folder holds one camera a file
         require_file(path, CALIBRATION_LABEL)
-    if unit is not None and unit not in LENGTH_UNITS:
-        raise InputError(f"--calib-unit: expected {', '.join(LENGTH_UNITS)}, found {unit!r}")
 
 
 @track_app.command()
@@ -159,7 +156,7 @@ def track(
             raise InputError(f"--export: expected some of {', '.join(EXPORT_FORMATS)}, found {kind!r}")
     if not videos.exists():
         raise InputError(f"expected videos at {videos}, found nothing there; check the path")
-    _check_calibration(calib, calib_unit)
+    _check_calibration(calib)
     if specimen is not None:
         require_file(specimen, SPECIMEN_LABEL)
     from rafl.tracking import commands

@@ -16,26 +16,13 @@ from rafl.calibration.foreign.camera import (
 )
 from rafl.calibration.foreign.mat_file import Unreadable, read_mat_variables
 from rafl.common.errors import InputError
+from rafl.common.units import METRES
 
 EXPORT = "in MATLAB: s = toStruct(stereoParams); save('calib.mat', '-struct', 's', '-v7')"
 MATRIX_KEYS = ("IntrinsicMatrix", "K")
 POSES = (("R", "t"), ("R", "T"), ("r", "t"), ("RotationMatrix", "TranslationVector"))
 BOARD_POSES = ("RotationVectors", "TranslationVectors")
 RADIAL, TANGENTIAL = ("RadialDistortion", "RDistort"), ("TangentialDistortion", "TDistort")
-UNITS = {  # WorldUnits, as one types them in MATLAB
-    "mm": 1e-3,
-    "millimeters": 1e-3,
-    "millimeter": 1e-3,
-    "cm": 1e-2,
-    "centimeters": 1e-2,
-    "centimeter": 1e-2,
-    "m": 1.0,
-    "meters": 1.0,
-    "meter": 1.0,
-    "in": 0.0254,
-    "inches": 0.0254,
-    "inch": 0.0254,
-}
 
 
 def read_matlab(path: Path) -> tuple[list[ForeignCamera], float | None]:
@@ -88,7 +75,7 @@ def _camera_structs(value: dict[str, Any], name: str = "") -> dict[str, dict[str
 
 
 def _unit(camera: Any) -> float | None:
-    return UNITS.get(str(camera.get("WorldUnits", "")).strip().lower()) if isinstance(camera, dict) else None
+    return METRES.get(str(camera.get("WorldUnits", "")).strip().lower()) if isinstance(camera, dict) else None
 
 
 def _camera(value: Any, where: str, pose: tuple[Array, Array] | None, name: str | None = None) -> ForeignCamera:

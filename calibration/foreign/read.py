@@ -17,8 +17,8 @@ from rafl.calibration.rig import Rig, read_calibration
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 from rafl.common.names import require_names
+from rafl.common.units import METRES, Unit
 
-UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}  # lengths [m] of the units that users name
 MAX_BYTES = 2**22  # a calibration with all its board points has some hundred kB
 OPENCV_SUFFIXES = (".yml", ".yaml", ".xml")
 LABEL = "a calibration (calib.yaml, or one of OpenCV, aniposelib, Caliscope, MATLAB or DLT coefficients)"
@@ -99,15 +99,15 @@ def _read_folder(folder: Path) -> tuple[list[ForeignCamera], float | None]:
 
 def _scale(path: Path, given: str | None, stated: float | None) -> float:
     """The unit of length of a file [m]."""
-    if given is not None and given not in UNITS:
-        raise InputError(f"expected a unit out of {', '.join(UNITS)}, found {given!r}")
+    if given is not None and given not in list(Unit):
+        raise InputError(f"expected a unit out of {', '.join(Unit)}, found {given!r}")
     if stated is None and given is None:
         raise InputError(
             f"{path} does not state the unit of its translations; state it, for instance with --calib-unit mm"
         )
-    if stated is not None and given is not None and not np.isclose(stated, UNITS[given]):
+    if stated is not None and given is not None and not np.isclose(stated, METRES[given]):
         raise InputError(f"{path} states a unit of {stated:g} m, found --calib-unit {given}; leave the option out")
-    return UNITS[given] if given is not None else stated or 0.0
+    return METRES[given] if given is not None else stated or 0.0
 
 
 def _names(path: Path, cameras: list[ForeignCamera], known: ImageSizes) -> list[str]:

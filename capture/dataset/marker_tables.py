@@ -22,18 +22,6 @@ Array = NDArray[Any]
 
 Rows = list[list[str]]
 MAX_TABLE_BYTES = 1_000_000_000
-# Metres in a unit, by its name in lower case.
-METRES = {
-    "m": 1.0,
-    "meters": 1.0,
-    "metres": 1.0,
-    "cm": 1e-2,
-    "centimeters": 1e-2,
-    "mm": 1e-3,
-    "millimeters": 1e-3,
-    "in": 0.0254,
-    "inches": 0.0254,
-}
 KNOWN = "CSV or TRC of rafl-track, Motive, Vicon, Qualisys, DLTdv, anipose or DeepLabCut"
 
 
