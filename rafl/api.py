@@ -15,8 +15,8 @@ from rafl.calibration.board_images import board_views, check_shared_world
 from rafl.calibration.foreign.read import read_any_calibration
 from rafl.calibration.rig import Rig, write_calibration
 from rafl.calibration.solve import solve_rig
-from rafl.capture.dataset.build import CaptureSettings
 from rafl.capture.dataset.build import build_dataset as build
+from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import read_recording_rows
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 from rafl.common.errors import InputError, SimulationError

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import Run, run_console_script
+from support import SMALL_SPECIMEN, Run, run_console_script
 
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 
@@ -34,15 +34,6 @@ _delete_stale_kernels()
 COMMANDS = multiprocessing.get_context("forkserver")
 COMMANDS.set_forkserver_preload(["support", "rafl.capture.commands", "rafl.commands", "rafl.tracking.commands"])
 
-SMALL = """format: rafl-specimen/1
-name: small
-geometry: {box_mm: [60, 20, 20], element_mm: 10}
-material: {youngs_modulus: 150000, poissons_ratio: 0.4, density: 1070, mass: lumped, integration: full}
-clamp: {face: x-min}
-simulation: {integrator: implicit-euler, substeps: 1}
-markers:
-"""
-
 
 def small_specimen_text() -> str:
     entries = [
@@ -51,7 +42,7 @@ def small_specimen_text() -> str:
         for row, z in (("a", 13), ("b", 7))
         for column, x in enumerate((8, 18, 28, 38, 52))
     ]
-    return SMALL + "\n".join(entries) + "\n"
+    return SMALL_SPECIMEN + "\n".join(entries) + "\n"
 
 
 @pytest.fixture

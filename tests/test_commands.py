@@ -14,7 +14,8 @@ from support import Run, assert_refused, draw_frame
 
 from rafl.calibration.camera import OrthographicCamera, Plane
 from rafl.calibration.rig import Rig, write_calibration
-from rafl.capture.dataset.build import CaptureSettings, build_dataset
+from rafl.capture.dataset.build import build_dataset
+from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.capture.specimen.specimen import Specimen, read_specimen

@@ -1,9 +1,9 @@
 """Building of datasets: registers recordings to a specimen and fits their first frames."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,21 +11,19 @@ from numpy.typing import NDArray
 
 from rafl.capture.dataset.modulus import estimate_modulus
 from rafl.capture.dataset.naming import in_layout_order
+from rafl.capture.dataset.registered import Registered, find_dataset_places
+from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.initial import FirstFrame, InitialState, fit_first_frame, fit_velocity
-from rafl.capture.registration.motion_start import MotionStart, find_motion_start
-from rafl.capture.registration.places import Places, find_places
+from rafl.capture.registration.motion_start import MotionStart
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import (
     Registration,
-    RestPose,
-    average_frames,
     fit_pose_near_clamp,
     fit_rest,
     register,
 )
-from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, pose_sigma
 from rafl.capture.registration.sequence import fit_by_sequence
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
@@ -37,36 +35,6 @@ Array = NDArray[Any]
 
 VELOCITY_WINDOW_FRAMES = 5  # the polynomial through all of them gives the velocity in the first frame
 SAME_PLACE = 1e-9  # [m]
-
-
-@dataclass(frozen=True)
-class CaptureSettings:
-    """Settings of `build_dataset`.
-
-    Attributes:
-        tolerance: largest distance of a marker from the surface of the mesh [m].
-        fit_tolerance: largest root mean square residual of the registration and of the first frame [m].
-        fps: frames per second of files without a frame rate.
-        rest: frames that show the undeformed specimen, if recorded.
-        moving_clamp: express the positions in the frame of the clamp markers, if there are any.
-        start: first frame of the recordings whose row has none; None finds it from the motion.
-        initial: `rest`: the first frame is an equilibrium; `moving`: it has a velocity; `auto`: either, as each
-            recording shows; `sequence`: as `rest`, fitted by a sequence of forces over time.
-        forces: virtual forces act on the `tip` or on the whole `surface`.
-        unit: of positions in tables that do not name it: m, cm or mm.
-        names: of markers in the specimen, by their names in the files, where they differ.
-    """
-
-    tolerance: float = 2e-3
-    fit_tolerance: float = 3e-3
-    fps: float = 100.0
-    rest: RestPose | None = None
-    moving_clamp: bool = True
-    start: int | None = None
-    initial: Literal["auto", "rest", "moving", "sequence"] = "auto"
-    forces: Literal["tip", "surface"] = "tip"
-    unit: str | None = None
-    names: dict[str, str] = field(default_factory=dict)
 
 
 def build_dataset(
@@ -116,8 +84,8 @@ def build_dataset(
     for row in rows:
         recording = recordings[row.recording]
         registration = register(recording, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
-        registered.append(_Registered.of(specimen, recording, row, registration, settings))
-    markers, registered = _find_places(empty, specimen, registered, known, settings)
+        registered.append(Registered.of(specimen, recording, row, registration, settings))
+    markers, registered = find_dataset_places(empty, specimen, registered, known, settings)
     empty = replace(empty, markers=markers)
     trajectories = {}
     for item in registered:
@@ -153,140 +121,7 @@ def _check_same_layout(markers: Markers, known: Markers) -> None:
         )
 
 
-@dataclass(frozen=True)
-class _Registered:
-    """A recording in the specimen frame.
-
-    Attributes:
-        recording, row, registration: of which it is made.
-        position, sigma: of the specimen's markers [m], (T, M, 3).
-        start: where the motion starts, and in which state.
-        last: last frame that is used.
-    """
-
-    recording: Recording
-    row: RecordingRow
-    registration: Registration
-    position: Array
-    sigma: Array
-    start: MotionStart
-    last: int
-
-    @classmethod
-    def of(
-        cls,
-        specimen: Specimen,
-        recording: Recording,
-        row: RecordingRow,
-        registration: Registration,
-        settings: CaptureSettings,
-    ) -> "_Registered":
-        """Transform a recording by its registration, without outliers, and find where its motion starts."""
-        own = len(specimen.layout.names)
-        position = registration.pose.apply(recording.position[:, :own])
-        sigma = registration.pose.rotate_sigma(recording.sigma[:, :own])
-        position[:, [name in registration.outliers for name in specimen.layout.names]] = np.nan
-        # Positions as recorded: if a clamp marker jumps, a specimen at rest would seem to move in the clamp's frame.
-        start = _motion_start(recording.position[:, :own], row, settings)
-        last = len(recording.time) - 1 if row.last_frame is None else row.last_frame
-        if not start.frame < last < len(recording.time):
-            raise InputError(
-                f"recording {row.recording}: expected frames within 0 to {len(recording.time) - 1}, found "
-                f"{start.frame} to {last}; correct recordings.csv"
-            )
-        return cls(recording, row, registration, position, sigma, start, last)
-
-    def with_pose(self, places: Places) -> "_Registered":
-        """The recording in the specimen frame, after its pose was found; sigma then contains that of the pose."""
-        registration = replace(
-            self.registration,
-            pose=places.pose,
-            covariance=places.pose_covariance,
-            pose_from_model=False,
-            modulus=places.modulus,
-            modulus_sigma=places.modulus_sigma,
-        )
-        position = places.pose.apply(self.position)
-        by_pose = pose_sigma(places.pose_covariance, position)
-        sigma = np.hypot(places.pose.rotate_sigma(self.sigma), by_pose)
-        return replace(self, registration=registration, position=position, sigma=sigma)
-
-    def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
-        """Mean marker positions at rest before the release, or those of the first frame."""
-        rest = slice(self.start.rest_start, max(self.start.frame, self.start.rest_start + 1))
-        target, sigma = average_frames(self.position[rest], self.sigma[rest])
-        name = self.row.recording
-        if np.isfinite(target[:, 0]).sum() < MIN_MARKERS:
-            raise InputError(
-                f"recording {name}, frame {self.start.frame}: expected at least {MIN_MARKERS} markers, found fewer; "
-                "start at a later first_frame"
-            )
-        surface = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
-        nodes = surface if whole_surface else specimen.loaded
-        return FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface)
-
-
-def _find_places(
-    dataset: Dataset,
-    specimen: Specimen,
-    registered: list[_Registered],
-    known: Markers | None,
-    settings: CaptureSettings,
-) -> tuple[Markers, list[_Registered]]:
-    """The markers at the places that the first frames show, and the recordings with the poses that these show.
-
-    Places stay as described where the elements lock: such a mesh follows a bent body less closely than a hand places a
-    dot. A recording that starts in motion shows neither places nor a pose, for its first frame is no equilibrium.
-
-    Args:
-        dataset: with the markers as described.
-        specimen: its description.
-        registered: recordings; the pose of some may be unknown.
-        known: markers whose places are known.
-        settings: tolerances and methods.
-
-    Raises:
-        InputError: the places are farther from the described ones than the tolerance.
-    """
-    markers = known or dataset.markers
-    fixed = known is not None or specimen.material.integration != "enhanced"
-    chosen = [item for item in registered if not item.start.moving and (item.registration.pose_from_model or not fixed)]
-    if not chosen:
-        return markers, registered
-    described = replace(dataset, markers=markers)
-    unknown = [item.registration.pose_from_model for item in chosen]
-    frames = [item.first_frame(described, specimen, whole_surface=False) for item in chosen]
-    frames = [
-        replace(frame, load=1e-3 * item.row.load_g) if posed else frame
-        for item, frame, posed in zip(chosen, frames, unknown, strict=True)
-    ]
-    targets = np.array([frame.target for frame, posed in zip(frames, unknown, strict=True) if posed])
-    pose = IDENTITY
-    if len(targets):
-        pose = fit_pose_near_clamp(specimen, average_frames(targets, np.ones_like(targets))[0])
-    sigma = 0.0 if fixed else specimen.layout.sigma
-    places = find_places(frames, unknown, pose, np.broadcast_to(sigma, len(markers.names)))
-    found = [
-        item.with_pose(places) if any(unknown) and item.registration.pose_from_model else item for item in registered
-    ]
-    if not fixed:
-        _check_places(specimen, dataset.markers, places.markers, settings)
-    return markers if fixed else places.markers, found
-
-
-def _check_places(specimen: Specimen, described: Markers, markers: Markers, settings: CaptureSettings) -> None:
-    """Raise InputError if the markers are farther from their described places than the tolerance."""
-    moved = np.linalg.norm(markers.rest - described.rest, axis=1)
-    distance = float(np.sqrt((moved**2).mean()))
-    if distance > settings.fit_tolerance:
-        raise InputError(
-            f"specimen {specimen.name}: expected the markers near their at_mm, found them {1e3 * distance:.2f} mm off "
-            f"in the first frames (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); check at_mm, that "
-            "the calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
-        )
-
-
-def _trajectory(dataset: Dataset, specimen: Specimen, item: _Registered, settings: CaptureSettings) -> Trajectory:
+def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings: CaptureSettings) -> Trajectory:
     """One recording from its release on, at even times, with its first frame fitted."""
     simulator, recording, row, registration = dataset.simulator, item.recording, item.row, item.registration
     position, sigma, start = item.position, item.sigma, item.start
@@ -368,17 +203,6 @@ def _fit_initial_state(
             "allow it with --fit-tolerance-mm"
         )
     return initial
-
-
-def _motion_start(position: Array, row: RecordingRow, settings: CaptureSettings) -> MotionStart:
-    """First frame and its state, by recordings.csv, the settings and the recorded motion."""
-    given = settings.start if row.first_frame is None else row.first_frame
-    if given is not None and given >= len(position):
-        raise InputError(
-            f"recording {row.recording}: expected a first frame within 0 to {len(position) - 1}, found {given}; "
-            "correct it"
-        )
-    return find_motion_start(position, "rest" if settings.initial == "sequence" else settings.initial, given)
 
 
 def _marker_velocity(position: Array, sigma: Array, time: Array, start: MotionStart) -> tuple[Array, Array]:

@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.capture.dataset.c3d import read_c3d
-from rafl.capture.dataset.marker_tables import METRES, read_marker_table
+from rafl.capture.dataset.marker_tables import read_marker_table
 from rafl.capture.registration.recording import Recording
 from rafl.common.arrays import ArrayFormat, check_shape, check_values
 from rafl.common.errors import InputError
 from rafl.common.files import sha256
 from rafl.common.names import require_names
+from rafl.common.units import METRES
 from rafl.tracking.reconstruction.gap_filling import MISSING
 from rafl.tracking.reconstruction.tracks import read_tracks
 
@@ -22,6 +23,7 @@ Array = NDArray[Any]
 ENDS = (".h5", ".csv", ".c3d", ".trc", ".tsv", "xyzpts.csv", ".npy")
 ASSUMED_SIGMA = 1e-4  # of files without uncertainties [m]
 MIN_FRAMES = 2
+LEAST_SIGMA = 1e-12  # [m]; nothing measures better, and the square of a much smaller one is 0 in the computer
 MAX_SPARSENESS = 100.0  # most frames that a recording may lack for each that it has; more are damage of its times
 RECORDING_FORMATS = {
     "time": ArrayFormat(("T",)),
@@ -87,8 +89,8 @@ def _check(recording: Recording) -> None:
     infinite_rest = recording.rest is not None and np.isinf(recording.rest).any()
     if infinite_rest or np.isinf(position).any() or not np.isfinite(position).any():
         raise ValueError("expected positions that are finite, or empty where missing, found others")
-    if not (recording.sigma[np.isfinite(position)] > 0.0).all():
-        raise ValueError("expected a sigma above 0 for every position, found another")
+    if not (recording.sigma[np.isfinite(position)] >= LEAST_SIGMA).all():
+        raise ValueError(f"expected a sigma of at least {LEAST_SIGMA:g} m for every position, found another")
 
 
 def _read(path: Path, fps: float, unit: str | None) -> Recording:

@@ -22,7 +22,6 @@ from rafl.data.dataset import THROUGH_MODEL
 
 Array = NDArray[Any]
 
-LEAST_SIGMA = 1e-9  # [m]; a file may say that a position is exact
 UNOBSERVED_SIGMA = 1.0  # [m], assumed for a coordinate that was not observed
 # Assumed bending of the marker farthest from the clamp, as a fraction of its distance; it grows quadratically.
 BENDING_FRACTION = 0.3
@@ -111,7 +110,7 @@ def average_frames(position: Array, sigma: Array) -> tuple[Array, Array]:
     Returns:
         Mean, NaN for markers that are missing in all frames, and sigma, infinite for these.
     """
-    sigma = np.maximum(np.where(np.isfinite(sigma), sigma, UNOBSERVED_SIGMA), LEAST_SIGMA)
+    sigma = np.where(np.isfinite(sigma), sigma, UNOBSERVED_SIGMA)
     measured = np.isfinite(position[..., :1])
     weight = np.where(measured, 1.0 / np.where(measured, sigma, 1.0) ** 2, 0.0)
     total, count = weight.sum(axis=0), measured.sum(axis=0)

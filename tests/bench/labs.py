@@ -22,7 +22,8 @@ import yaml
 from rich.console import Console
 
 from rafl.api import fit
-from rafl.capture.dataset.build import CaptureSettings, build_dataset
+from rafl.capture.dataset.build import build_dataset
+from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 from rafl.common.command_line import create_table

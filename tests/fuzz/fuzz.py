@@ -169,6 +169,7 @@ def main() -> None:
     parser.add_argument("--log", type=Path, help="write every outcome to this file, one JSON object a line")
     options = parser.parse_args()
     start = time.monotonic()
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # ends the workers too
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         # In a process of its own: OpenMP ends workers that are forked from a process that has used it.

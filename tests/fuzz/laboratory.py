@@ -8,7 +8,7 @@ import numpy as np
 import torch
 import trimesh
 import yaml
-from support import draw_frame
+from support import SMALL_SPECIMEN, draw_frame
 
 from rafl.calibration.camera import OrthographicCamera, Plane
 from rafl.calibration.rig import Rig, rig_text, write_calibration
@@ -29,16 +29,12 @@ SIZE = (200, 160)  # of the video [px]
 LOADS = {"take1": 0.04, "take2": 0.06, "take3": 0.08}  # [kg]
 SPLITS = dict(zip(LOADS, ("train", "val", "test"), strict=True))
 
-SPECIMEN = """format: rafl-specimen/1
-name: small
-geometry: {box_mm: [60, 20, 20], element_mm: 10}
-material: {youngs_modulus: 150000, poissons_ratio: 0.4, density: 1070, mass: lumped, integration: full}
-clamp: {face: x-min}
-simulation: {integrator: implicit-euler, substeps: 1}
-markers:
-  - {name: L, face: y-min, at_mm: [10, 0, 14], rows: 2, columns: 4, spacing_mm: [12, 8]}
+SPECIMEN = (
+    SMALL_SPECIMEN
+    + """  - {name: L, face: y-min, at_mm: [10, 0, 14], rows: 2, columns: 4, spacing_mm: [12, 8]}
   - {name: R, face: y-max, at_mm: [10, 20, 14], rows: 2, columns: 4, spacing_mm: [12, 8]}
 """
+)
 BOARD = """format: rafl-board/1
 pattern: {kind: charuco, squares: [9, 6], square_mm: 10.0, marker_mm: 7.5, dictionary: DICT_4X4_250}
 simultaneous: false

@@ -3,7 +3,7 @@
 import pickle
 import re
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -107,21 +107,20 @@ def replace_file(path: Path, random: Random) -> None:
 
 def replace_number(path: Path, random: Random) -> None:
     """Another number, or none, for one of a text's numbers."""
-    text = path.read_text(errors="surrogateescape")
-    found = list(re.finditer(r"-?\d+(\.\d+)?(e[-+]?\d+)?", text))
-    if found:
-        match = found[int(random.integers(len(found)))]
-        text = text[: match.start()] + pick(random, HOSTILE_TEXTS) + text[match.end() :]
-    path.write_text(text, errors="surrogateescape")
+    _replace_match(path, random, r"-?\d+(\.\d+)?(e[-+]?\d+)?", HOSTILE_TEXTS)
 
 
 def replace_word(path: Path, random: Random) -> None:
     """A hostile name for one of a text's words."""
+    _replace_match(path, random, r"[A-Za-z]\w*", HOSTILE_NAMES)
+
+
+def _replace_match(path: Path, random: Random, pattern: str, values: Sequence[str]) -> None:
     text = path.read_text(errors="surrogateescape")
-    found = list(re.finditer(r"[A-Za-z]\w*", text))
+    found = list(re.finditer(pattern, text))
     if found:
         match = found[int(random.integers(len(found)))]
-        text = text[: match.start()] + pick(random, HOSTILE_NAMES) + text[match.end() :]
+        text = text[: match.start()] + pick(random, values) + text[match.end() :]
     path.write_text(text, errors="surrogateescape")
 
 

@@ -16,6 +16,15 @@ from rafl.common.kernels import MESSAGE
 
 ROOT = Path(__file__).parents[2]
 SHARED = Path(os.environ.get("SHARED", ROOT.parent / "shared")).resolve()
+# A specimen file up to its list of markers.
+SMALL_SPECIMEN = """format: rafl-specimen/1
+name: small
+geometry: {box_mm: [60, 20, 20], element_mm: 10}
+material: {youngs_modulus: 150000, poissons_ratio: 0.4, density: 1070, mass: lumped, integration: full}
+clamp: {face: x-min}
+simulation: {integrator: implicit-euler, substeps: 1}
+markers:
+"""
 
 RAMP_FRAMES = 12  # frames of the video that `write_video` makes of `ramp_frame`
 
