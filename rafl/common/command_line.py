@@ -1,10 +1,7 @@
 """Code that all commands share: error reports, application settings, progress bars."""
 
 import functools
-import signal
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
 import typer
@@ -14,13 +11,10 @@ from rich.table import Column, Table
 from rich.text import Text
 
 from rafl.common.errors import InputError
+from rafl.common.interruption import Terminated, interruptible
 
 P = ParamSpec("P")
 R = TypeVar("R")
-
-
-class _Terminated(KeyboardInterrupt):
-    """The system asks the program to end (SIGTERM). What follows Ctrl-C follows: temporary files are removed."""
 
 
 def report_errors(command: Callable[P, R]) -> Callable[P, R]:
@@ -33,7 +27,7 @@ def report_errors(command: Callable[P, R]) -> Callable[P, R]:
     @functools.wraps(command)
     def wrapped(*args: P.args, **kwargs: P.kwargs) -> R:
         try:
-            with _ended_by_sigterm():
+            with interruptible():
                 return command(*args, **kwargs)
         except InputError as error:
             raise _failure(f"error: {error}", 2) from None
@@ -47,7 +41,7 @@ def report_errors(command: Callable[P, R]) -> Callable[P, R]:
             raise _failure(message, 2) from None
         except KeyboardInterrupt as error:
             message = "interrupted; no incomplete file was left"
-            raise _failure(message, 143 if isinstance(error, _Terminated) else 130) from None
+            raise _failure(message, 143 if isinstance(error, Terminated) else 130) from None
 
     return wrapped
 
@@ -61,25 +55,6 @@ def one_line(text: str) -> str:
     """A text in one line of visible characters; others, as names from files may have, as escape sequences."""
     parts = (part if part.isprintable() else part.encode("unicode_escape").decode() for part in " ".join(text.split()))
     return "".join(parts)
-
-
-@contextmanager
-def _ended_by_sigterm() -> Iterator[None]:
-    """Let SIGTERM raise `_Terminated`, once, unless the program that started this one has chosen otherwise."""
-    in_main = threading.current_thread() is threading.main_thread()
-    if not in_main or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield
-        return
-
-    def terminate(number: int, frame: object) -> None:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # nothing interrupts the removal of temporary files
-        raise _Terminated
-
-    signal.signal(signal.SIGTERM, terminate)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
 
 
 def create_app(help_text: str) -> typer.Typer:

@@ -3,6 +3,7 @@
 import io
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -63,6 +64,28 @@ def test_sigterm_removes_temporary_files(tmp_path: Path) -> None:
     assert text.startswith("interrupted; ")
     assert list(tmp_path.iterdir()) == []
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_interruption_inside_a_destructor_ends_the_command(number: int, code: int) -> None:
+    class Waiting:
+        def __del__(self) -> None:
+            os.kill(os.getpid(), number)
+            time.sleep(0.1)  # the signal is handled here, where Python drops what is raised
+
+    def command() -> None:
+        waiting = Waiting()
+        del waiting
+        time.sleep(30.0)
+
+    before, hook = signal.signal(signal.SIGINT, signal.default_int_handler), sys.unraisablehook
+    try:
+        start = time.monotonic()
+        assert end(command)[0] == code
+        assert time.monotonic() - start < 10.0
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert sys.unraisablehook == hook
 
 
 def test_text_is_unchanged_where_it_can_be_seen() -> None:
