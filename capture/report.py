@@ -16,8 +16,8 @@ FRAMES_PER_ROW = 3
 PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}</title>
 <style>
  body{font:16px/1.5 system-ui,sans-serif;max-width:66rem;margin:2rem auto;padding:0 1rem;color:#222}
- table{border-collapse:collapse;margin:1rem 0}
- th,td{padding:.25rem .8rem;text-align:right;border-bottom:1px solid #ddd}
+ table{border-collapse:collapse;margin:1rem 0;display:block;overflow-x:auto}
+ th,td{padding:.25rem .6rem;text-align:right;border-bottom:1px solid #ddd}
  td:first-child,th:first-child{text-align:left}
  img{max-width:100%} .note{color:#666} .worse{color:#c0392b}
 </style>
@@ -35,8 +35,11 @@ frame. First frame fit: root mean square distance between the markers of the fit
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 <h2>Young's modulus</h2>
 <p class="note">Each recording shows it twice: by the bend under the load that was released, and by the frequency of the
-swing. The two depend on different quantities: the load, or the frame rate and the density. The specimen's description
-has {{ assumed }} kPa.</p>
+swing. The two depend on different quantities: the load, or the frame rate and the density. Both take Poisson's ratio
+{{ ratio }} from the specimen's description, which has a Young's modulus of {{ assumed }} kPa.{% if locking %} Elements
+of <code>integration: {{ locking }}</code> add a resistance to bending that depends on Poisson's ratio and on the size
+of the elements, so the values hold with this ratio on this mesh only. <code>preset: physical</code> gives the
+material's own.{% endif %}</p>
 <table><tr><th>recording</th><th>bend [kPa]</th><th>swing [kPa]</th><th>frequency [Hz]</th></tr>
 {% for row in moduli %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 <h2>First frames</h2>
@@ -85,6 +88,10 @@ def dataset_page(specimen: Specimen, dataset: Dataset) -> str:
             ],
             places=_places(dataset.markers),
             assumed=f"{1e-3 * dataset.simulator.material.youngs_modulus:.3g}",
+            ratio=f"{dataset.simulator.material.poissons_ratio:g}",
+            locking=""
+            if dataset.simulator.material.integration == "enhanced"
+            else dataset.simulator.material.integration,
             moduli=[_moduli(name, item.attributes) for name, item in items.items()],
             registrations=[_registration(name, item.attributes) for name, item in items.items()],
         )
