@@ -69,7 +69,8 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
     count, log_modulus, markers = len(layout.names), 0.0, layout
     moved = np.zeros((count, 3))
     fits: list[LinearFit | None] = [None] * len(frames)
-    model_sigma = MODEL_FRACTION * float(np.ptp(layout.rest, axis=0).max())  # until the deflection is known
+    until_known = MODEL_FRACTION * float(np.ptp(layout.rest, axis=0).max())  # until the deflection is known
+    model_sigma = np.full(len(frames), until_known)
     by_place = np.repeat(np.maximum(prior_sigma, MIN_PRIOR_SIGMA) ** -2.0, 3)
     # A pose that no frame depends on stays as it is.
     by_pose = np.zeros(6) if any(unknown) else np.ones(6)
@@ -79,17 +80,18 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
         softened = replace(simulator, material=replace(simulator.material, youngs_modulus=modulus))
         hessian = np.diag(precision)
         gradient = precision * np.concatenate([[log_modulus], np.zeros(6), moved.ravel()])
-        deflection = []
         for k, frame in enumerate(frames):
             current = replace(frame, simulator=softened, markers=markers)
             if unknown[k]:
                 current = replace(current, target=pose.apply(frame.target))
-            fit = fit_linear_forces(current, model_sigma, fits[k])
+            fit = fit_linear_forces(current, float(model_sigma[k]), fits[k])
             fits[k] = fit
             own_hessian, own_gradient = _reduced_normal_equations(current, fit, unknown[k])
             hessian += own_hessian
             gradient += own_gradient
-            deflection.append(markers.positions(torch.from_numpy(fit.q)).numpy() - markers.rest)
+            deflection = markers.positions(torch.from_numpy(fit.q)).numpy() - markers.rest
+            size = float(np.sqrt(np.mean((deflection**2).sum(-1))))
+            model_sigma[k] = np.sqrt(len(frames)) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
         covariance = _inverse(hessian)
         step = -covariance @ gradient
         step *= min(1.0, MAX_MODULUS_STEP / max(abs(step[0]), MAX_MODULUS_STEP))
@@ -97,8 +99,6 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
         pose = pose.followed_by(step[1:7])
         moved = moved + step[7:].reshape(-1, 3)
         markers = embed(simulator.mesh, layout.names, layout.rest + moved)
-        size = float(np.sqrt(np.mean(np.square(deflection).sum(-1))))
-        model_sigma = float(np.sqrt(len(frames))) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
         tolerance = np.concatenate(
             [[MODULUS_TOLERANCE], np.full(6, POSE_TOLERANCE), np.full(3 * count, STEP_TOLERANCE)]
         )
