@@ -62,7 +62,7 @@ def create_app(help_text: str) -> typer.Typer:
     return typer.Typer(
         help=help_text,
         add_completion=False,
-        rich_markup_mode="markdown",
+        rich_markup_mode=None,
         pretty_exceptions_enable=False,
         context_settings={"help_option_names": ["-h", "--help"]},
     )

@@ -52,13 +52,18 @@ def read_hdf5(path: Path, label: str, advice: str) -> Iterator[h5py.File]:
 
     Raises:
         InputError: no such file, no HDF5, a link, an array stored elsewhere or by a filter that HDF5 does not have
-            built in, more content than its size allows, or an error while it is open.
+            built in, more content than its size allows, a file that another program writes, or an error while it is
+            open.
     """
     require_file(path, label)
     try:
         with h5py.File(path, "r") as file:
             _check_self_contained(file, MAX_EXPANSION_BYTES + path.stat().st_size)
             yield file
+    except BlockingIOError:  # HDF5 locks a file while it is written
+        raise InputError(
+            f"expected {label} in {path}, found that another program has it open; close it there"
+        ) from None
     except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
         reason = (
             describe_validation(error) if isinstance(error, pydantic.ValidationError) else " ".join(str(error).split())

@@ -1,5 +1,7 @@
 """HDF5 files: composed in memory and written whole; read only if they hold all of a bounded content themselves."""
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -74,6 +76,20 @@ def test_no_hdf5_is_refused(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(InputError, match=MESSAGE.format("")), read_hdf5(path, "a file", "make it again"):
         pass
+
+
+def test_file_that_another_program_writes_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "file.h5"
+    writer = f"import h5py; file = h5py.File({str(path)!r}, 'w'); file.flush(); print(1, flush=True); input()"
+    with subprocess.Popen([sys.executable, "-c", writer], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        with (
+            pytest.raises(InputError, match=r"found that another program has it open; close it there$"),
+            read_hdf5(path, "a file", "make it again"),
+        ):
+            pass
+        process.kill()
 
 
 def test_file_packed_with_gzip_is_read(tmp_path: Path) -> None:
