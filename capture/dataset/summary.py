@@ -62,9 +62,8 @@ def warnings(dataset: Dataset) -> list[str]:
                 "name in the tracks"
             )
     if names := dataset.registered_through_model:
-        lines.append(
-            f"recordings {', '.join(names)}: {_frame_through_model(dataset.trajectories[names[0]].attributes)}"
-        )
+        found = [dataset.trajectories[name].attributes for name in names]
+        lines.append(f"recordings {', '.join(names)}: {_frame_through_model(found)}")
     for name, item in dataset.trajectories.items():
         if outliers := item.attributes.get("set_aside"):
             lines.append(
@@ -81,17 +80,27 @@ def warnings(dataset: Dataset) -> list[str]:
     return lines + contradictions(dataset)
 
 
-def _frame_through_model(attributes: dict[str, Any]) -> str:
-    """What is known of a frame that was found through the model, and what would tell it."""
+def _frame_through_model(recordings: list[dict[str, Any]]) -> str:
+    """What is known of a frame that was found through the model, and what would tell it.
+
+    The swing shows Young's modulus whatever the frame is: where it shows another, the frame is that uncertain.
+
+    Args:
+        recordings: attributes of those in the frame.
+    """
     advice = "film the undeformed specimen (--rest), or put three markers on the clamp"
-    modulus, sigma = (
-        float(attributes.get(key, np.nan)) for key in ("registration_modulus", "registration_modulus_sigma")
-    )
+    keys = ("registration_modulus", "registration_modulus_sigma")
+    modulus, sigma = (float(recordings[0].get(key, np.nan)) for key in keys)
     if not np.isfinite(sigma):
         return f"their frame was found through the assumed material, which a fitted material then depends on; {advice}"
-    found = f"their frame was found together with E = {1e-3 * modulus:.0f} kPa, {100 * sigma:.0f} % uncertain"
+    swings = np.array([float(attributes.get("swing_modulus", np.nan)) for attributes in recordings])
+    swing = float(np.median(swings[np.isfinite(swings)])) if np.isfinite(swings).any() else modulus
+    also = "" if abs(np.log(swing / modulus)) <= sigma else f", where their swing shows {1e-3 * swing:.0f} kPa"
+    sigma = float(np.hypot(sigma, np.log(swing / modulus)))
+    found = f"their frame was found together with E = {1e-3 * modulus:.0f} kPa, {100 * sigma:.0f} % uncertain{also}"
     if sigma > TOLD_APART:
-        return f"{found}: the two cannot be told apart; {advice}, or give the loads that hang (load_g)"
+        unloaded = all(float(attributes.get("load_g", 0.0)) == 0.0 for attributes in recordings)
+        return f"{found}: the two cannot be told apart; {advice}{', or give load_g' if unloaded else ''}"
     return f"{found}, from the loads in recordings.csv, whose errors a fitted material then has; better {advice}"
 
 

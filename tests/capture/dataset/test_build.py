@@ -146,8 +146,13 @@ def test_a_frame_found_through_the_model_does_not_absorb_a_wrong_modulus(
     assert np.abs(item.markers - truth[1:]).max() < 5e-4
     assert (np.abs(item.markers - truth[1:]) < 4.0 * item.sigma).all()
     assert "from the loads in recordings.csv" in warnings(built)[0]
+    contradicting = replace(item, attributes=item.attributes | {"swing_modulus": 1.3 * found})
+    swung = warnings(replace(built, trajectories={"q0": contradicting}))[0]
+    assert f"where their swing shows {1.3e-3 * found:.0f} kPa: the two cannot be told apart" in swung
+    assert "give load_g" not in swung
     unknown = build(assumed, tmp_path, load_g=0)
     assert "cannot be told apart" in warnings(unknown)[0]
+    assert "or give load_g" in warnings(unknown)[0]
 
 
 def test_an_outlier_is_left_out_and_named(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
