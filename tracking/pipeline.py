@@ -121,9 +121,13 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         if lost := [name for name in settings.layout.names if name not in seen]:
             notes.append(f"markers {', '.join(lost)} of the specimen were never found")
     for camera, item in followed.items():
-        damaged = np.flatnonzero(item.damaged)
-        if len(damaged):
-            notes.append(f"{videos[camera].path.name}: frames {_range_text(damaged)} are damaged and count as missing")
+        for frames, what in (
+            (item.damaged, "are damaged"),
+            (item.repeated, "show the frame before again while the body moves"),
+        ):
+            if frames.any():
+                text = _range_text(np.flatnonzero(frames))
+                notes.append(f"{videos[camera].path.name}: frames {text} {what} and count as missing")
     return Tracks(
         names=tuple(order),
         time=clock - clock[0],

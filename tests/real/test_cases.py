@@ -129,6 +129,13 @@ def test_a_camera_that_began_later(run: Run) -> None:
     assert "right began 5.0 frames later" in result.stdout
 
 
+def test_frames_that_a_camera_showed_again(run: Run) -> None:
+    videos = CASES / "video-frozen-frames" / "videos"
+    result = run("rafl-track", videos, "--calib", CALIB, "--specimen", SPECIMEN, "--out", "tracks")
+    assert result.returncode == 0, result.stderr
+    assert "left.mp4: frames 6 to 13 show the frame before again while the body moves" in result.stdout
+
+
 def test_one_unreadable_video(run: Run, tmp_path: Path) -> None:
     shutil.copytree(CASES / "one-unreadable-video" / "v", tmp_path / "v")
     result = run("rafl-track", "v", "--calib", SEED / "calib.yaml", "--out", "tracks")

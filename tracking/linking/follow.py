@@ -14,6 +14,7 @@ from rafl.common.errors import InputError
 from rafl.tracking.detection.appearance import find_markers
 from rafl.tracking.detection.detect import Dots, to_eight_bits
 from rafl.tracking.linking.late_markers import LateMarker
+from rafl.tracking.linking.repeated_frames import find_repeated_frames
 from rafl.tracking.linking.shape_prior import ShapePrior
 from rafl.tracking.linking.tracker import MIN_SHAPES, Tracker
 from rafl.tracking.reconstruction.uncertainty import filtered_positions, noise_fraction
@@ -39,6 +40,7 @@ class PixelTracks:
         start: positions in the first frame that shows markers [px], (D, 2); predicted for late-detected markers.
         late_count: number of late-detected markers, which are the last ones.
         damaged: frames that could not be decoded, (T).
+        repeated: frames that show the one before again while the body moves, (T).
         images: the first frame and the ten worst ones as JPEG, by frame number.
         notes: contradictions in the video's own statements.
     """
@@ -49,6 +51,7 @@ class PixelTracks:
     start: Array
     late_count: int
     damaged: NDArray[np.bool_]
+    repeated: NDArray[np.bool_]
     images: dict[int, bytes]
     notes: tuple[str, ...]
 
@@ -106,8 +109,18 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     if late:
         is_late = np.arange(len(start)) >= len(start) - len(late)
         start = _predict_late_starts(start, pixel, is_late, tracker.static_dots.mask)
+    repeated = find_repeated_frames(pixel, sigma)
+    pixel[repeated], sigma[repeated] = np.nan, np.nan
     return PixelTracks(
-        np.array(times), pixel, sigma, start, len(late), np.array(damaged), images.result(), tuple(reading.notes)
+        np.array(times),
+        pixel,
+        sigma,
+        start,
+        len(late),
+        np.array(damaged),
+        repeated,
+        images.result(),
+        tuple(reading.notes),
     )
 
 
