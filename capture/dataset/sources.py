@@ -24,6 +24,7 @@ ENDS = (".h5", ".csv", ".c3d", ".trc", ".tsv", "xyzpts.csv", ".npy")
 ASSUMED_SIGMA = 1e-4  # of files without uncertainties [m]
 MIN_FRAMES = 2
 LEAST_SIGMA = 1e-12  # [m]; nothing measures better, and the square of a much smaller one is 0 in the computer
+FARTHEST = 1e3  # [m]; no camera reconstructs a marker that is farther away
 MAX_SPARSENESS = 100.0  # most frames that a recording may lack for each that it has; more are damage of its times
 RECORDING_FORMATS = {
     "time": ArrayFormat(("T",)),
@@ -89,6 +90,9 @@ def _check(recording: Recording) -> None:
     infinite_rest = recording.rest is not None and np.isinf(recording.rest).any()
     if infinite_rest or np.isinf(position).any() or not np.isfinite(position).any():
         raise ValueError("expected positions that are finite, or empty where missing, found others")
+    farthest = np.nanmax(np.abs(position))
+    if farthest > FARTHEST:
+        raise ValueError(f"expected positions within {FARTHEST:g} m, found {farthest:.3g} m")
     if not (recording.sigma[np.isfinite(position)] >= LEAST_SIGMA).all():
         raise ValueError(f"expected a sigma of at least {LEAST_SIGMA:g} m for every position, found another")
 

@@ -139,9 +139,9 @@ class HexMesh:
         size = np.ptp(self.vertices[self.hexes], axis=1).max(axis=1, keepdims=True)
         degenerate = determinant <= 1e-9 * size**3
         if degenerate.any():
-            worst = int(np.argmin((determinant / size**3).min(axis=1)))
+            cell = int(np.argmax(degenerate.any(axis=1)))
             raise ValueError(
-                f"cell {worst} is inverted or flat (Jacobian {determinant[worst].min():.3g} m^3); "
+                f"cell {cell} is inverted or flat (Jacobian {determinant[cell].min():.3g} m^3); "
                 "its eight nodes must run z fastest, then y, then x"
             )
         gradient = np.einsum("gnj,egji->egni", local, np.linalg.inv(jacobian))

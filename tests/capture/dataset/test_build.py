@@ -297,6 +297,16 @@ def test_invalid_files_and_frames_are_refused(small_specimen: Specimen, truth: n
         build(small_specimen, tmp_path)
 
 
+def test_a_marker_farther_away_than_anything_is_refused(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    recorded = truth[1:].copy()
+    recorded[4, 2, 1] = 1e5
+    write_q0_tracks(small_specimen, tmp_path, recorded, np.full_like(recorded, 1e-5))
+    with pytest.raises(InputError, match=r"q0\.h5: expected positions within 1000 m, found 1e\+05 m"):
+        build(small_specimen, tmp_path)
+
+
 @pytest.mark.parametrize("least", [0.0, 1e-200])
 def test_an_impossible_sigma_is_refused(
     least: float, small_specimen: Specimen, truth: np.ndarray, tmp_path: Path

@@ -115,15 +115,18 @@ def test_max_edge_change_and_its_bound() -> None:
     assert mesh.max_edge_change_bound(np.array([1e-3])) == pytest.approx(mesh.max_edge_change(opposite[None]))
 
 
-@pytest.mark.parametrize("damage", ["inverted", "flat"])
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("damage", ["inverted", "flat", "a point"])
 def test_error_names_the_inverted_or_flat_cell(damage: str) -> None:
     mesh = HexMesh.box((3, 1, 1), (0.03, 0.01, 0.01))
     vertices, hexes = mesh.vertices.copy(), mesh.hexes.copy()
     if damage == "inverted":
         hexes[1] = hexes[1][[4, 5, 6, 7, 0, 1, 2, 3]]
-    else:
+    elif damage == "flat":
         vertices[hexes[1, 4:], 0] = vertices[hexes[1, :4], 0]
         hexes = hexes[:2]
+    else:
+        hexes[1] = 0
     with pytest.raises(ValueError, match="cell 1 is inverted or flat"):
         _ = HexMesh(vertices, hexes).quadrature
 
