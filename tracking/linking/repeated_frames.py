@@ -26,7 +26,7 @@ def find_repeated_frames(pixel: Array, sigma: Array) -> NDArray[np.bool_]:
     """
     motion = np.diff(pixel, axis=0)
     relative = motion / np.hypot(sigma[1:], sigma[:-1])
-    known = np.isfinite(relative).all(axis=2)
+    known = np.isfinite(relative.sum(axis=2))
     count = known.sum(axis=1)
     squares = np.where(known[..., None], relative, 0.0) ** 2
     step = np.sqrt(squares.sum(axis=(1, 2)) / np.maximum(2 * count, 1))

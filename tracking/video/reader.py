@@ -101,7 +101,7 @@ def open_video(path: Path) -> Video:
     """Open a video; only its first frame is decoded.
 
     Raises:
-        InputError: missing or unreadable.
+        InputError: missing, unreadable or interlaced.
     """
     if path.is_dir():
         paths = _image_paths(path)
@@ -120,7 +120,14 @@ def open_video(path: Path) -> Video:
             size = (getattr(stream, "width", 0), getattr(stream, "height", 0))  # missing if no decoder is known
             if min(size) < 1:
                 raise InputError(f"expected a video in {path}, found {size[0]} x {size[1]} px; export it again")
-            if _first_quarter_turns(container, stream) % 2:
+            first = _first_frame(container, stream)
+            if first is not None and first.interlaced_frame:
+                raise InputError(
+                    f"{path}: expected frames that are exposed at once, found interlaced ones, with every second line "
+                    "from another time; record progressive video, or make a frame of each half (ffmpeg -i VIDEO -vf "
+                    "yadif=1 -crf 12 NEW.mp4; setfield=prog instead of yadif=1 if only the file's tag is wrong)"
+                )
+            if first is not None and quarter_turns(first) % 2:
                 size = (size[1], size[0])
             return Video(path, size, frames, fps, _capture_fps(container.metadata))
     except (av.FFmpegError, OSError) as error:
@@ -138,16 +145,18 @@ def _capture_fps(metadata: dict[str, str]) -> float:
     return rate if 0.0 < rate < np.inf else 0.0
 
 
-def _first_quarter_turns(container: "av.container.InputContainer", stream: "av.video.stream.VideoStream") -> int:
-    """Number of anticlockwise quarter turns by which the first frame is to be displayed."""
+def _first_frame(
+    container: "av.container.InputContainer", stream: "av.video.stream.VideoStream"
+) -> "av.VideoFrame | None":
+    """The first frame that can be decoded; None if there is none."""
     for packet in read_packets(container, stream, []):
         try:
             frames = packet.decode()
         except av.FFmpegError:
             continue
-        for frame in frames:
-            return quarter_turns(frame)
-    return 0
+        if frames:
+            return frames[0]
+    return None
 
 
 def _image_reader(paths: list[Path]) -> Callable[[Path], Array | None]:

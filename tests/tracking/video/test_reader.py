@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support import RAMP_FRAMES, ramp_frame, write_video
 
+from rafl.common.errors import InputError
 from rafl.tracking.video.decoding import Decoder, _decode_all, read_frames
 from rafl.tracking.video.frame_order import DecodedFrame, DecodedPacket, FrameOrder
 from rafl.tracking.video.quantisation import STEP_EQUIVALENTS
@@ -307,6 +308,17 @@ def test_sixteen_bit_images(tmp_path: Path) -> None:
         cv2.imwrite(str(folder / f"{number}.png"), (ramp_frame(number).astype(np.uint16) * 16 + 5))
     for number, frame in enumerate(open_video(folder).read()):
         np.testing.assert_allclose(frame.image, ramp_frame(number) + 5 / 16)
+
+
+@pytest.mark.parametrize(
+    ("name", "codec", "options"),
+    [("a.mp4", "libx264", {"x264-params": "tff=1"}), ("a.mpg", "mpeg2video", {"flags": "+ildct+ilme"})],
+)
+def test_interlaced_video_is_refused(tmp_path: Path, name: str, codec: str, options: dict[str, str]) -> None:
+    path = tmp_path / name
+    write_video(path, codec, "yuv420p", rate=50, options=options)
+    with pytest.raises(InputError, match=f"{name}: expected frames that are exposed at once, found interlaced ones"):
+        open_video(path)
 
 
 def test_stopping_early_leaves_no_thread(tmp_path: Path) -> None:
