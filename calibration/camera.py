@@ -26,6 +26,21 @@ class Plane:
     sigma: float
 
 
+@dataclass(frozen=True)
+class Perspective:
+    """Perspective that the images of an orthographic camera show.
+
+    Attributes:
+        distance: of the camera from the world origin [m].
+        depth: along the line of sight, from the world origin, at which the camera's scale is exact [m].
+        centre: pixel at which points do not move with their depth, (2): that about which the calibration's points lie.
+    """
+
+    distance: float
+    depth: float
+    centre: tuple[float, float]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Camera:
     """Base of the camera models: world to camera, projection to undistorted pixels, then distortion.
@@ -75,6 +90,15 @@ class Camera:
         """
         raise NotImplementedError
 
+    def model_error(self, points: Array, depth_sigma: Array) -> Array:
+        """Expected error of the model itself at world points (..., 3) [m], in undistorted pixels (..., 2).
+
+        Args:
+            points: world points [m], (..., 3).
+            depth_sigma: of their distances from the camera [m], (...).
+        """
+        return np.zeros((*points.shape[:-1], 2))
+
     def distort(self, undistorted: Array) -> Array:
         """Distorted pixels (..., 2) of undistorted pixels (..., 2)."""
         raise NotImplementedError
@@ -107,12 +131,14 @@ class OrthographicCamera(Camera):
         skew: [px/m].
         offset: undistorted pixel of the world origin [px], (2).
         distortion: k1, k2 about the image centre, for radii in units of half the image diagonal.
+        perspective: that the model leaves out; None if the calibration's images show none.
     """
 
     scale: tuple[float, float]
     skew: float = 0.0
     offset: tuple[float, float] = (0.0, 0.0)
     distortion: tuple[float, float] = (0.0, 0.0)
+    perspective: Perspective | None = None
 
     @cached_property
     def projection_matrix(self) -> Array:
@@ -134,6 +160,16 @@ class OrthographicCamera(Camera):
         """See `Camera`."""
         slopes = np.broadcast_to(self.projection_matrix, (*undistorted.shape[:-1], 2, 3))
         return slopes, undistorted - np.asarray(self.offset)
+
+    def model_error(self, points: Array, depth_sigma: Array) -> Array:
+        """See `Camera`: a point farther away than where the scale is exact appears nearer to the centre."""
+        if self.perspective is None:
+            return super().model_error(points, depth_sigma)
+        centre = np.asarray(self.perspective.centre)
+        depth = points @ self.viewing_direction - self.perspective.depth
+        size = np.sign(depth) * np.hypot(depth, depth_sigma)
+        result: Array = (centre - self.project_undistorted(points)) * (size / self.perspective.distance)[..., None]
+        return result
 
     def distort(self, undistorted: Array) -> Array:
         """See `Camera`."""

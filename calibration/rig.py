@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 from pydantic import Field, field_validator
 
-from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane
+from rafl.calibration.camera import Camera, OrthographicCamera, Perspective, PinholeCamera, Plane
 from rafl.calibration.fields import Direction, PositivePair
 from rafl.common.files import write_text
 from rafl.common.names import Name, check_distinct, require_names
@@ -36,6 +36,12 @@ class _PlaneEntry(StrictModel):
     normal: Direction
     offset_mm: float
     sigma_mm: float = Field(PLANE_SIGMA_MM, gt=0)
+
+
+class _PerspectiveEntry(StrictModel):
+    distance_m: float = Field(gt=0)
+    depth_mm: float
+    centre_px: tuple[float, float]
 
 
 class _Entry(StrictModel):
@@ -81,15 +87,18 @@ class _OrthographicEntry(_Entry):
     skew: float = 0.0
     offset_px: tuple[float, float]
     distortion: tuple[float, float] = (0.0, 0.0)
+    perspective: _PerspectiveEntry | None = None
 
     def camera(self) -> Camera:
         """The camera, in SI units."""
         mx, my = self.pixels_per_mm
+        seen = self.perspective
         return OrthographicCamera(
             scale=(1e3 * mx, 1e3 * my),
             skew=1e3 * self.skew,
             offset=self.offset_px,
             distortion=self.distortion,
+            perspective=None if seen is None else Perspective(seen.distance_m, 1e-3 * seen.depth_mm, seen.centre_px),
             **self.common_arguments(),
         )
 
@@ -167,6 +176,12 @@ def _entry(camera: Camera) -> dict[str, object]:
             "offset_px": list(camera.offset),
             "distortion": list(camera.distortion),
         }
+        if camera.perspective is not None:
+            entry["perspective"] = {
+                "distance_m": camera.perspective.distance,
+                "depth_mm": 1e3 * camera.perspective.depth,
+                "centre_px": list(camera.perspective.centre),
+            }
     elif isinstance(camera, PinholeCamera):
         entry |= {
             "model": "pinhole",

@@ -15,7 +15,14 @@ from scipy.spatial.transform import Rotation
 
 from rafl.calibration.board import BoardFile, View
 from rafl.calibration.bundle import INVERSE_DISTANCE, LENS, Adjustment, Observations, adjust_bundle, move_points
-from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera, Plane, centre_and_half_diagonal
+from rafl.calibration.camera import (
+    Camera,
+    OrthographicCamera,
+    Perspective,
+    PinholeCamera,
+    Plane,
+    centre_and_half_diagonal,
+)
 from rafl.calibration.initial_guess import (
     CameraGroup,
     collect_observations,
@@ -141,7 +148,26 @@ def _solve_group(group: CameraGroup, tilt_signs: dict[str, int], model: str) -> 
                 )
         chosen, board_error = _fit_board(observations, _fit_lens(observations, chosen))
         inverse_distances = _inverse_distances(group, chosen)
-    return replace(_build_solution(group, observations, chosen, inverse_distances, model), board_error=board_error)
+    solution = _build_solution(group, observations, chosen, inverse_distances, model)
+    if model == "orthographic":
+        solution = replace(solution, rig=_with_perspective(solution, observations, pinhole))
+    return replace(solution, board_error=board_error)
+
+
+def _with_perspective(solution: Solution, observations: Observations, pinhole: Adjustment) -> Rig:
+    """The orthographic cameras with the perspective that a pinhole adjustment of the same views shows significantly."""
+    cameras = dict(solution.rig.cameras)
+    for k, (name, camera) in enumerate(solution.rig.cameras.items()):
+        inverse_distance, sigma = solution.inverse_distances[name]
+        assert isinstance(camera, OrthographicCamera)
+        if inverse_distance > MIN_PERSPECTIVE_SIGMAS * sigma:
+            # The pinhole's scale is that at the world origin, and falls with 1 + depth / distance.
+            scale = 1e3 * pinhole.unknowns.cameras[k, :2].mean()
+            depth = (scale / np.mean(camera.scale) - 1.0) / inverse_distance
+            centre = observations.pixels[observations.camera == k].mean(axis=0)
+            perspective = Perspective(1.0 / inverse_distance, float(depth), tuple(centre.tolist()))
+            cameras[name] = replace(camera, perspective=perspective)
+    return Rig(cameras)
 
 
 def _inverse_distances(group: CameraGroup, found: Adjustment) -> dict[str, tuple[float, float]]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.calibration.camera import OrthographicCamera
 from rafl.calibration.rig import Rig, rig_text
 from rafl.common.errors import InputError
 from rafl.common.files import sha256
@@ -97,6 +98,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     in_order = {camera: _arrange_columns(item, names[camera], order) for camera, item in followed.items()}
     offsets = {camera: rig.cameras[camera].time_offset for camera in in_order}
     notes = [note for item in followed.values() for note in item.notes]
+    notes += [note for camera in in_order for note in _perspective_note(rig, camera)]
     if settings.fps is None:
         notes += [note for camera, item in followed.items() for note in slow_motion_note(videos[camera], item.time)]
     if settings.sync and len(in_order) > 1:
@@ -146,6 +148,18 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         settings=settings.text(),
         notes=tuple(notes),
     )
+
+
+def _perspective_note(rig: Rig, camera: str) -> list[str]:
+    """A note on an orthographic camera whose calibration shows perspective."""
+    model = rig.cameras[camera]
+    seen = model.perspective if isinstance(model, OrthographicCamera) else None
+    if seen is None:
+        return []
+    return [
+        f"camera {camera}: its calibration shows perspective, as from {seen.distance:.2f} m away, and sigma contains "
+        "the error of the orthographic model; calibrate with --model pinhole"
+    ]
 
 
 def _arrange_columns(item: PixelTracks, names: list[str | None], order: list[str]) -> CameraPixels:

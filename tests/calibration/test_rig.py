@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from rafl.calibration.camera import OrthographicCamera, Plane
+from rafl.calibration.camera import OrthographicCamera, Perspective, Plane
 from rafl.calibration.rig import Rig, read_calibration, write_calibration
 from rafl.common.errors import InputError
 
@@ -16,6 +16,7 @@ CAMERA = OrthographicCamera(
     plane=Plane((0.0, -1.0, 0.0), 0.03, 4e-4),
     time_offset=0.002,
     residual=0.05,
+    perspective=Perspective(1.5, -0.002, (320.0, 250.0)),
     covariance=tuple(tuple(float(i * j) for j in range(10)) for i in range(10)),
 )
 
@@ -32,6 +33,7 @@ def test_written_rig_reads_back(tmp_path: Path) -> None:
     assert back.plane.sigma == pytest.approx(4e-4)
     assert (back.skew, back.time_offset, back.residual) == pytest.approx((3.0, 0.002, 0.05))
     assert back.covariance == CAMERA.covariance
+    assert back.perspective == CAMERA.perspective
 
 
 @pytest.mark.parametrize(

@@ -203,6 +203,11 @@ def test_perspective_is_detected(random: np.random.Generator) -> None:
     assert inverse_distance == pytest.approx(1.0, abs=0.05)
     assert sigma < 0.02
     assert solution.perspective_bias("left", 0.010) == pytest.approx(0.64e-3, rel=0.1)
+    side = left(solution)
+    points = random.uniform([0.0, -0.02, 0.0], [0.1, 0.02, 0.03], (500, 3))
+    error, expected = near.project(points) - side.project(points), side.model_error(points, np.zeros(500))
+    assert (expected**2).mean() == pytest.approx((error**2).mean(), rel=0.3)
+    assert ((error - expected) ** 2).mean() < 0.15 * (error**2).mean()
     found = solve_one(views_of(near, random), model="pinhole").rig.cameras["left"]
     assert isinstance(found, PinholeCamera)
     points = random.uniform(0.0, 0.05, (50, 3))
@@ -210,6 +215,7 @@ def test_perspective_is_detected(random: np.random.Generator) -> None:
     exact = solve_one(views_of(side_camera(), random))
     inverse_distance, sigma = exact.inverse_distances["left"]
     assert abs(inverse_distance) < 4 * sigma
+    assert left(exact).perspective is None
     with pytest.raises(InputError, match="orthographic model"):
         solve_one(views_of(side_camera(), random), model="pinhole")
 

@@ -81,7 +81,8 @@ def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array
     """Triangulate every marker by weighted least squares over the cameras that see it.
 
     Where one camera alone sees a marker, that camera's plane is added as a measurement. A camera with too large a
-    residual is left out. If only two cameras see a marker and they disagree, it counts as not seen.
+    residual is left out. If only two cameras see a marker and they disagree, it counts as not seen. The standard
+    deviations contain what an orthographic model makes of a camera's perspective.
 
     Args:
         rig: the cameras.
@@ -115,7 +116,23 @@ def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array
         name: np.linalg.norm(rig.cameras[name].project(solution.position) - item.pixel, axis=-1)
         for name, item in pixels.items()
     }
-    return solution.position, solution.sigma, residual
+    return solution.position, np.hypot(solution.sigma, _model_error(rig, pixels, seen, solution)), residual
+
+
+def _model_error(
+    rig: Rig, pixels: dict[str, CameraPixels], seen: dict[str, NDArray[np.bool_]], solution: "_Solution"
+) -> Array:
+    """What the errors of the camera models add to the positions [m], (T, M, 3)."""
+    right = np.zeros_like(solution.position)
+    alone = _count(seen) == 1
+    for name, item in pixels.items():
+        camera = rig.cameras[name]
+        by_plane = 0.0 if camera.plane is None else camera.plane.sigma
+        error = camera.model_error(solution.position, np.where(seen[name] & alone, by_plane, 0.0))
+        weighted = np.where(seen[name][..., None], error / item.sigma**2, 0.0)
+        right += np.einsum("...k,...ki->...i", weighted, camera.projection_jacobian(solution.position))
+    result: Array = (solution.covariance @ right[..., None])[..., 0]
+    return result
 
 
 def _count(seen: dict[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
@@ -126,10 +143,16 @@ def _count(seen: dict[str, NDArray[np.bool_]]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Positions and their sigmas [m], (T, M, 3), NaN where no camera sees the marker."""
+    """Positions [m], (T, M, 3), and their covariances [m^2], (T, M, 3, 3), NaN where no camera sees the marker."""
 
     position: Array
-    sigma: Array
+    covariance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviations [m], (T, M, 3)."""
+        result: Array = np.sqrt(np.diagonal(self.covariance, axis1=-2, axis2=-1))
+        return result
 
     @classmethod
     def of(
@@ -173,8 +196,7 @@ class _Solution:
             position = position + step
             if np.abs(step).max(initial=0.0) < 1e-12:
                 break
-        sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
-        return cls(position, np.where(known[..., None], sigma, np.nan))
+        return cls(position, np.where(known[..., None, None], covariance, np.nan))
 
 
 def _excess(

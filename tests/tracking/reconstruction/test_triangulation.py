@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import stereo
 
-from rafl.calibration.camera import OrthographicCamera, PinholeCamera, Plane
+from rafl.calibration.camera import OrthographicCamera, Perspective, PinholeCamera, Plane
 from rafl.calibration.foreign.read import read_any_calibration
 from rafl.calibration.rig import Rig, write_calibration
 from rafl.common.errors import InputError
@@ -53,6 +53,20 @@ def test_one_camera_places_a_marker_on_its_plane() -> None:
     bare = replace(SIDE, plane=None)
     with pytest.raises(InputError, match=r"camera side alone .* no plane"):
         triangulate(Rig({"side": bare}), {"side": film(bare, points)})
+
+
+def test_sigma_contains_the_perspective_that_the_model_leaves_out() -> None:
+    """From 2 m away, a marker 5 mm behind where the scale is exact is taken to be 1/400 nearer to the centre."""
+    centre = (630.0, 340.0)
+    camera = replace(SIDE, perspective=Perspective(2.0, 0.005, centre), plane=Plane((0.0, -1.0, 0.0), -0.01, 1e-9))
+    points = np.array([[[0.02, 0.01, 0.03]]])
+    expected = np.abs(camera.project(points)[0, 0] - centre) * 0.005 / 2.0 / 6000.0
+    pixels = {"side": film(camera, points, sigma=1e-4)}
+    _, sigma, _ = triangulate(Rig({"side": camera}), pixels)
+    np.testing.assert_allclose(sigma[0, 0, [0, 2]], expected, rtol=1e-3)
+    by_plane = replace(camera, plane=Plane((0.0, -1.0, 0.0), -0.01, 0.012))
+    _, sigma, _ = triangulate(Rig({"side": by_plane}), pixels)
+    np.testing.assert_allclose(sigma[0, 0, [0, 2]], expected * 13 / 5, rtol=1e-3)
 
 
 def test_unseen_markers_are_nan() -> None:
