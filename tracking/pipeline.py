@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from rafl.calibration.camera import OrthographicCamera
 from rafl.calibration.rig import Rig, rig_text
+from rafl.calibration.summary import MAX_SILENT_BIAS_M
 from rafl.common.errors import InputError
 from rafl.common.files import sha256
 from rafl.common.version import VERSION
@@ -98,7 +99,6 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     in_order = {camera: _arrange_columns(item, names[camera], order) for camera, item in followed.items()}
     offsets = {camera: rig.cameras[camera].time_offset for camera in in_order}
     notes = [note for item in followed.values() for note in item.notes]
-    notes += [note for camera in in_order for note in _perspective_note(rig, camera)]
     if settings.fps is None:
         notes += [note for camera, item in followed.items() for note in slow_motion_note(videos[camera], item.time)]
     if settings.sync and len(in_order) > 1:
@@ -112,6 +112,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     frame = {camera: shown_frames(time, clock) for camera, time in rig_times.items()}
     pixels = {camera: resample_pixels(item, rig_times[camera], clock) for camera, item in in_order.items()}
     position, sigma, residual = triangulate(rig, pixels)
+    notes += [note for camera in in_order for note in _perspective_note(rig, camera, position)]
     position, sigma, state = fill_gaps(position, sigma, clock, settings.fill)
     measured = int((state == MEASURED).any(axis=0).sum())
     if measured < MIN_MARKERS:
@@ -150,15 +151,20 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     )
 
 
-def _perspective_note(rig: Rig, camera: str) -> list[str]:
-    """A note on an orthographic camera whose calibration shows perspective."""
+def _perspective_note(rig: Rig, camera: str, position: Array) -> list[str]:
+    """A note on an orthographic camera whose perspective makes an error at positions (T, M, 3) [m]."""
     model = rig.cameras[camera]
     seen = model.perspective if isinstance(model, OrthographicCamera) else None
-    if seen is None:
+    known = position[np.isfinite(position[..., 0])]
+    if seen is None or not len(known):
+        return []
+    pixels_per_metre = np.linalg.norm(model.projection_jacobian(np.zeros(3))[0])
+    error = float(np.abs(model.model_error(known, np.zeros(len(known)))).max() / pixels_per_metre)
+    if error < MAX_SILENT_BIAS_M:
         return []
     return [
-        f"camera {camera}: its calibration shows perspective, as from {seen.distance:.2f} m away, and sigma contains "
-        "the error of the orthographic model; calibrate with --model pinhole"
+        f"camera {camera}: its calibration shows perspective, as from {seen.distance:.2f} m away; the orthographic "
+        f"model is up to {1e3 * error:.2f} mm wrong, which sigma contains; calibrate with --model pinhole"
     ]
 
 

@@ -1,0 +1,52 @@
+"""What the notes of a recording say."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from support import draw_frame, write_video
+
+from rafl.calibration.camera import OrthographicCamera, Perspective, Plane
+from rafl.calibration.rig import Rig
+from rafl.tracking.pipeline import TrackingSettings, track_recording
+from rafl.tracking.video.reader import open_video
+
+SIZE = (200, 160)
+CAMERA = OrthographicCamera(
+    image_size=SIZE, scale=(1e4, 1e4), rotation_vector=(0.0, 0.0, 0.0), plane=Plane((0.0, 0.0, 1.0), 0.0, 1e-4)
+)
+
+
+def moving_dots(path: Path, shown: list[int]) -> None:
+    """A lossless video of 12 dots; frame t shows them after shown[t] steps of 2 px."""
+    frames = []
+    for step in shown:
+        dots = [(40.0 + 30 * i + 2 * step, 40.0 + 35 * j, 6.0, 6.0, 0.0) for i in range(4) for j in range(3)]
+        frames.append(np.rint(draw_frame(dots, SIZE, noise=1.0, seed=step)).clip(0, 255).astype(np.uint8))
+    write_video(path, "ffv1", "gray", frames=frames)
+
+
+def notes_of(path: Path, camera: OrthographicCamera) -> str:
+    settings = TrackingSettings(None, None, 3)
+    return "; ".join(track_recording({"front": open_video(path)}, Rig({"front": camera}), settings, lambda: None).notes)
+
+
+def test_perspective_is_noted_where_it_makes_an_error(tmp_path: Path) -> None:
+    """The outermost dot is 6 mm from the image centre and 8 mm behind where the scale is exact."""
+    moving_dots(tmp_path / "a.mkv", list(range(8)))
+    assert notes_of(tmp_path / "a.mkv", CAMERA) == ""
+    near = replace(CAMERA, perspective=Perspective(1.0, -0.008, (99.5, 79.5)))
+    note = notes_of(tmp_path / "a.mkv", near)
+    assert note.startswith(
+        "camera front: its calibration shows perspective, as from 1.00 m away; the orthographic model"
+    )
+    assert "up to 0.05 mm wrong" in note
+    far = replace(CAMERA, perspective=Perspective(20.0, -0.008, (99.5, 79.5)))
+    assert notes_of(tmp_path / "a.mkv", far) == ""
+
+
+def test_frames_shown_again_are_noted(tmp_path: Path) -> None:
+    moving_dots(tmp_path / "a.mkv", [0, 1, 2, 2, 2, 5, 6, 7, 7, 9])
+    assert notes_of(tmp_path / "a.mkv", CAMERA) == (
+        "a.mkv: frames 3 to 4, 8 show the frame before again while the body moves and count as missing"
+    )
