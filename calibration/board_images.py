@@ -6,6 +6,7 @@ from rafl.calibration.board import MIN_POINTS, BoardFile, View
 from rafl.calibration.detection.image_file import image_size, read_grey_image
 from rafl.common.command_line import progress
 from rafl.common.errors import InputError
+from rafl.common.files import find_copies
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 
@@ -19,13 +20,15 @@ def board_views(images: Path, description: BoardFile) -> tuple[Views, Sizes]:
     Each subfolder of `images` is a camera. Without subfolders, `images` itself is one camera.
 
     Raises:
-        InputError: there are no images, an image cannot be read, a camera's images differ in size, the description
-            names an image that is not there, or the board in the images has another size than described.
+        InputError: there are no images, two are the same, an image cannot be read, a camera's images differ in size,
+            the description names an image that is not there, or the board has another size than described.
     """
     if not images.is_dir():
         raise InputError(f"expected a folder of board images at {images}, found none; check the path")
     paths = _image_paths(images)
     _check_named_images(description, paths, images)
+    if copies := find_copies(path for own in paths.values() for path in own.values()):
+        raise InputError(f"expected different images, found {copies[0]} in {copies[1]} again; remove one")
     views, sizes = {}, {}
     for name, own in paths.items():
         views[name], sizes[name] = _find_views(name, own, description)

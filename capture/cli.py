@@ -128,6 +128,9 @@ def specimen(
         float | None,
         typer.Option(min=1.0, help="Young's modulus [Pa], if measured to about 10 % [assumed]."),
     ] = None,
+    density: Annotated[
+        float | None, typer.Option(min=1.0, help="Density [kg/m3], if measured: mass by volume [assumed].")
+    ] = None,
     lying: Annotated[
         bool, typer.Option("--lying", help="The specimen lies flat, so that gravity does not bend it.")
     ] = False,
@@ -179,7 +182,7 @@ def specimen(
             )
     from rafl.capture import commands
 
-    body = commands.SpecimenBody(size, surface, like, element_mm, youngs_modulus)
+    body = commands.SpecimenBody(size, surface, like, element_mm, youngs_modulus, density)
     commands.describe_specimen(still, body, lying, unit and unit.value, out)
 
 

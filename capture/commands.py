@@ -139,7 +139,7 @@ class SpecimenBody:
     Attributes:
         size_mm, surface, like: of a box, a surface, or another specimen file; one of them is not None.
         element_mm: edge of the elements; None to choose it.
-        youngs_modulus: measured [Pa]; None for that of the material.
+        youngs_modulus, density: measured [Pa, kg/m^3]; None for those of the material.
     """
 
     size_mm: tuple[float, float, float] | None
@@ -147,6 +147,7 @@ class SpecimenBody:
     like: Path | None
     element_mm: float | None
     youngs_modulus: float | None
+    density: float | None
 
     def read(self, name: str, folder: Path) -> Body:
         """The description of a specimen of this name, for a file in `folder`."""
@@ -157,7 +158,8 @@ class SpecimenBody:
         else:
             assert self.size_mm is not None
             body = body_of_box(name, self.size_mm, self.element_mm)
-        return body if self.youngs_modulus is None else body.with_modulus(self.youngs_modulus)
+        given = {"youngs_modulus": self.youngs_modulus, "density": self.density}
+        return body.with_material(**{key: value for key, value in given.items() if value is not None})
 
 
 def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str | None, out: Path) -> None:
@@ -191,14 +193,15 @@ def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str |
         }
         for k in found.listed
     ]
+    assumed = "Poisson's ratio is" if given.density else "density and Poisson's ratio are"
     remarks = {
         "": f"Described from {still.name} by rafl-specimen. Look at {out.with_suffix('.png').name}.",
-        "material": f"To check: density and Poisson's ratio are assumed. Young's modulus {_modulus_text(found)}.",
+        "material": f"To check: {assumed} assumed. Young's modulus {_modulus_text(found)}.",
         "clamp": "To check: the face that is held, and the face on which loads hang.",
         "markers": "Places on the undeformed body. A place that you measured better replaces the one found here.",
     }
     drawing = draw_description(found, f"{body.name}, from {still.name}")
-    text = specimen_text(body.with_modulus(found.youngs_modulus), markers, remarks)
+    text = specimen_text(body.with_material(youngs_modulus=found.youngs_modulus), markers, remarks)
     with written_files({out.with_suffix(".png"): drawing, out: text}):
         pass
     for name, distance in found.left_out.items():
@@ -270,7 +273,7 @@ def capture(
         (update_dataset if update else write_dataset)(path, dataset)
     Console(width=130).print(recordings_table(dataset))
     for line in warnings(dataset):
-        typer.echo(line, err=True)
+        typer.echo(f"warning: {line}", err=True)
     typer.echo(f"wrote {path} and {report}")
     typer.echo(f"next: rafl-fit {path}")
 

@@ -208,7 +208,7 @@ def check_calibration(calib: Path, unit: str | None, images: Path, board: Path) 
 
 def _print_next(out: Path) -> None:
     typer.echo(f"wrote {out}")
-    typer.echo(f"next: rafl-track videos/ --calib {out} --specimen specimen.yaml")
+    typer.echo(f"next: rafl-track videos/ --calib {out} (with --specimen, once there is a specimen file)")
 
 
 def _values_by_camera(option: str, given: list[str], cameras: list[str], allowed: tuple[str, ...]) -> dict[str, str]:
@@ -310,7 +310,7 @@ def track(
         first = next(iter(failed))
         raise InputError(f"recording {first}: {failed[first]}")
     write_report(out / "report.html", done, rig)
-    _print_results(out, done, failed, len(kept), layout is not None)
+    _print_results(out, done, failed, len(kept), specimen)
     if failed:
         raise typer.Exit(1)
 
@@ -335,7 +335,9 @@ def _announce_filmed(calib: Path, videos: Path, count: int) -> dict[str, tuple[i
     return filmed
 
 
-def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int, named: bool) -> None:
+def _print_results(
+    out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int, specimen: Path | None
+) -> None:
     Console(width=110).print(_summary_table(done))
     for name, tracks in done.items():
         for note in tracks.notes:
@@ -345,10 +347,23 @@ def _print_results(out: Path, done: dict[str, Tracks], failed: dict[str, str], k
     if kept:
         typer.echo(f"kept the tracks of {kept} recordings: nothing changed since they were tracked")
     typer.echo(f"wrote {len(done) - kept} tracks files to {out}/; look at {out}/report.html")
-    if named:
-        typer.echo(f"next: rafl-capture specimen.yaml {out} --recordings recordings.csv")
+    if specimen:
+        typer.echo(f"next: rafl-capture {specimen} {out} --recordings recordings.csv")
     else:
-        typer.echo(f"next: rafl-specimen {out}/STILL.h5 --box 100x30x30, with the recording at rest and the size in mm")
+        still = min(done, key=lambda name: _extent(done[name]))
+        typer.echo(
+            f"next: rafl-specimen {out}/{still}.h5 --box LENGTHxWIDTHxHEIGHT (of the body in mm), if it is at rest"
+        )
+
+
+def _extent(tracks: Tracks) -> float:
+    """How far the markers move, in the mean of those that are seen [m]."""
+    spread = [
+        np.ptp(one[np.isfinite(one[:, 0])], axis=0).max()
+        for one in np.moveaxis(tracks.position, 1, 0)
+        if np.isfinite(one[:, 0]).any()
+    ]
+    return float(np.mean(spread))
 
 
 @contextmanager

@@ -139,6 +139,7 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
     first = slice(start.frame, start.frame + 1)
     pose = initial.pose if registration.pose_from_model else registration.pose.select_frames(first)
     residual = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - initial.pose.apply(frame.target)
+    residual[frame.measured] = np.where(frame.observed_axes, residual[frame.measured], 0.0)
     return Trajectory(
         time,
         markers,

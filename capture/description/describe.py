@@ -13,7 +13,7 @@ from rafl.capture.description.still import Dots, dots_at_rest
 from rafl.capture.description.undeformed import PLACED_SIGMA, Shape, Undeformed, carry_back, find_undeformed
 from rafl.capture.registration.places import MODULUS_SIGMA
 from rafl.capture.registration.recording import Recording
-from rafl.capture.registration.rigid import MARKERS_PER_OUTLIER, MIN_MARKERS, RigidTransform
+from rafl.capture.registration.rigid import MIN_MARKERS, RigidTransform
 from rafl.capture.specimen.geometry import read_surface
 from rafl.capture.specimen.specimen import Body, build_specimen
 from rafl.common.errors import InputError
@@ -26,6 +26,7 @@ MAX_POSE_SIGMA = 1e-3  # largest standard deviation of a dot's place that an unk
 UNKNOWN_POSE_SIGMA = 1e-2  # of the height and tilt of a body whose frame is found with E in turn [m]
 MAX_MODULUS_SIGMAS = 3.0  # E farther off the assumed one contradicts it [standard deviations of log E]
 POSE_ITERATIONS = 3  # of the frame and E in turn
+MAX_LEFT_OUT = 0.1  # share of the dots that may lie on no face: specks beside the specimen, or a hand's slip
 MAX_DISTANCE = 3e-3  # of a dot from every face [m]: half a millimetre of the hand, and a body cast not quite to size
 
 
@@ -119,8 +120,8 @@ def describe(
         assumed = specimen.material.youngs_modulus
         raise InputError(
             f"{label}: expected a sag of the assumed material, {1e-3 * assumed:.3g} kPa, found that of one near "
-            f"{1e-3 * modulus:.3g} kPa; correct the size of the body or --youngs-modulus, or say that it lies flat "
-            "(--lying)"
+            f"{1e-3 * modulus:.3g} kPa; correct the size of the body or --youngs-modulus, say that it lies flat "
+            "(--lying) if it does, or check that no camera has the video or the calibration images of another"
         )
     return Description(shape, dots, names, listed, undeformed, modulus, left_out, modulus_sigma)
 
@@ -159,7 +160,7 @@ def _dots_on_body(
     """
     distance, allowed = _distances(shape, q, dots, modulus_sigma)
     far, total = distance > allowed, len(dots.names) + len(left_out)
-    if far.sum() + len(left_out) > max(1, total // MARKERS_PER_OUTLIER) or (~far).sum() < MIN_MARKERS:
+    if far.sum() + len(left_out) > max(1.0, MAX_LEFT_OUT * total) or (~far).sum() < MIN_MARKERS:
         worst = int(np.argmax(distance))
         found = (
             f"{label}: expected the dots within {1e3 * MAX_DISTANCE:g} mm of the body's faces, found {int(far.sum())} "
@@ -179,7 +180,7 @@ def _reason(shape: Shape, q: Array, dots: Dots) -> str:
         moved = pose.apply(dots.position)
         distance = carry_back(shape, q, replace(dots, position=moved)).distance
         motion = moved - dots.position
-        if np.mean(distance > MAX_DISTANCE) <= 1.0 / MARKERS_PER_OUTLIER and (
+        if np.mean(distance > MAX_DISTANCE) <= MAX_LEFT_OUT and (
             best is None or np.linalg.norm(motion) < np.linalg.norm(best[0])
         ):
             best = motion, pose

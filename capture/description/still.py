@@ -38,7 +38,7 @@ class Dots:
 
 
 def dots_at_rest(recording: Recording, label: str) -> Dots:
-    """Mean positions over all frames if nothing moves, else over the rest before the first sudden motion.
+    """Mean positions over the frames at rest: most of them, or those before the first sudden motion.
 
     Args:
         recording: in any frame of reference.
@@ -47,11 +47,11 @@ def dots_at_rest(recording: Recording, label: str) -> Dots:
     Raises:
         InputError: the specimen never rests, or fewer than three dots are seen.
     """
-    frames = _frames_at_rest(recording)
-    if frames.stop - frames.start < MIN_REST_FRAMES and len(recording.position) >= MIN_REST_FRAMES:
+    frames, count = _frames_at_rest(recording), len(recording.position)
+    if frames.sum() < min(MIN_REST_FRAMES, count):
         raise InputError(
-            f"{label}: expected a specimen that rests, found it moving in all {len(recording.position)} frames; film "
-            "it again once it hangs still"
+            f"{label}: expected a specimen that rests, found no rest in most of its {count} frames, nor before a "
+            "release; film it again once it hangs still"
         )
     position, sigma = average_frames(recording.position[frames], recording.sigma[frames])
     names = recording.names or tuple(str(number + 1) for number in range(len(position)))
@@ -64,23 +64,24 @@ def dots_at_rest(recording: Recording, label: str) -> Dots:
     return dots
 
 
-def _frames_at_rest(recording: Recording) -> slice:
-    """All frames if the dots stay, within noise, at their median positions; else those at rest before the release."""
+def _frames_at_rest(recording: Recording) -> NDArray[np.bool_]:
+    """Frames in which the dots are, within noise, at their median positions; if few, those at rest before a release."""
     position = recording.position
-    everything = slice(0, len(position))
     seen = np.isfinite(position[..., 0]).any(axis=0)
     if len(position) < MIN_REST_FRAMES or not seen.any():
-        return everything
+        return np.ones(len(position), bool)
     position, sigma = position[:, seen], recording.sigma[:, seen]
     distance = _root_mean_square(position - np.nanmedian(position, axis=0))
     change = _root_mean_square(np.diff(position, 2, axis=0))
     scatter = np.median(change[np.isfinite(change)]) / np.sqrt(6.0) if np.isfinite(change).any() else 0.0
     # A lossy video may repeat an error from frame to frame, so that the scatter is less than the error.
     error = np.sqrt(3.0) * np.nanmedian(np.where(np.isfinite(position), sigma, np.nan).min(axis=2))
-    if not (distance > REST_NOISE_FACTOR * max(scatter, error)).any():
-        return everything
-    release = find_release(position)
-    return slice(release.rest_start, release.start)
+    moved: NDArray[np.bool_] = distance > REST_NOISE_FACTOR * max(scatter, error)
+    if moved.mean() < 0.5:
+        return ~moved
+    release, rest = find_release(position), np.zeros(len(position), bool)
+    rest[release.rest_start : release.start] = True
+    return rest
 
 
 def _root_mean_square(vectors: Array) -> Array:

@@ -110,10 +110,10 @@ class Body(StrictModel):
     load: _Load = _Load(face="x-max")
     simulation: _Simulation = _Simulation()
 
-    def with_modulus(self, youngs_modulus: float) -> "Body":
-        """The body with another Young's modulus [Pa], to four digits."""
-        material = self.material.model_copy(update={"youngs_modulus": float(f"{youngs_modulus:.4g}")})
-        return self.model_copy(update={"material": material})
+    def with_material(self, **values: float) -> "Body":
+        """The body with other values of its material (Young's modulus [Pa], density [kg/m^3]), to four digits."""
+        rounded = {key: float(f"{value:.4g}") for key, value in values.items()}
+        return self.model_copy(update={"material": self.material.model_copy(update=rounded)})
 
 
 class SpecimenFile(Body):

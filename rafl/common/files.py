@@ -7,7 +7,7 @@ import os
 import platform
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -217,6 +217,20 @@ def require_folder(path: Path, label: str) -> Path:
     if not path.is_dir():
         raise InputError(f"expected {label} at {path}, found a file; name the folder")
     return path
+
+
+def find_copies(paths: Iterable[Path]) -> tuple[Path, Path] | None:
+    """Two files of one content among several; None if there are none. Folders do not count."""
+    by_size: dict[int, list[Path]] = {}
+    for path in paths:
+        if path.is_file():
+            by_size.setdefault(path.stat().st_size, []).append(path)
+    for alike in by_size.values():
+        digests = [sha256(path) for path in alike] if len(alike) > 1 else []
+        for number, digest in enumerate(digests):
+            if digest in digests[:number]:
+                return alike[digests.index(digest)], alike[number]
+    return None
 
 
 def sha256(path: Path) -> str:

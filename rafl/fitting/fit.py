@@ -123,12 +123,15 @@ def open_run(run: Path, settings: Settings, resume: bool) -> Iterator[None]:
         earlier = read_settings(run)
         if earlier != settings:
             raise InputError(
-                f"expected the settings in {run}/config.yaml to resume, found others; use the same settings"
+                f"expected the settings and datasets in {run}/config.yaml to resume, found others; use the same, or "
+                "choose another --out"
             )
         yield
         return
     if (run / SETTINGS_FILE).exists():
-        raise InputError(f"{run} already holds a run; choose another --out, or continue it with --resume")
+        raise InputError(
+            f"{run} already holds a run; choose another --out, continue it with --resume, or remove the folder"
+        )
     with new_folders(run):
         write_settings(run, settings)
         try:

@@ -143,8 +143,8 @@ def parameter_sentences(table: pd.DataFrame, through_model: bool = False) -> lis
         )
     elif not found:
         lines.append(
-            "no 95 % intervals: the values are at their bounds, or the search ended before a minimum (the default "
-            "ends early; --method sysid-branches searches on)"
+            "no 95 % intervals: the search ended before a minimum, as that of the default does once the error hardly "
+            "falls, or all values are at their bounds; --method sysid-branches searches on"
         )
     for a, b in itertools.combinations(range(len(table)), 2):
         c = float(table[f"correlation_{table['name'][b]}"][a])

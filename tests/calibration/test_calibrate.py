@@ -45,6 +45,11 @@ def dot_grid(tmp_path: Path) -> Path:
     return folder
 
 
+def test_an_image_that_is_there_twice_is_refused(dot_grid: Path, run: Run) -> None:
+    (dot_grid / "copy.png").write_bytes((dot_grid / "3.png").read_bytes())
+    assert_refused(run("rafl-calibrate", dot_grid, "--out", "calib.yaml"), "expected different images", "copy.png")
+
+
 def test_dot_grid_calibrates_one_camera(dot_grid: Path, run: Run, tmp_path: Path) -> None:
     result = run("rafl-calibrate", dot_grid, "--out", "calib.yaml")
     assert result.returncode == 0, result.stderr

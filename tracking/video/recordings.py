@@ -5,6 +5,7 @@ from pathlib import Path
 
 from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
+from rafl.common.files import find_copies
 from rafl.common.names import require_names
 from rafl.tracking.video.reader import VIDEO_SUFFIXES, Video, is_video, natural_key, open_video, visible_entries
 
@@ -27,8 +28,12 @@ def open_videos(paths: dict[str, Path], rig: Rig) -> dict[str, Video]:
     """Open the videos of one recording, by camera.
 
     Raises:
-        InputError: one cannot be opened, or has another size than its camera.
+        InputError: one cannot be opened, or has another size than its camera, or two are the same.
     """
+    if copies := find_copies(paths.values()):
+        raise InputError(
+            f"expected a video of every camera, found {copies[0]} in {copies[1]} again; copy the right one"
+        )
     return {camera: _open_checked(path, rig, camera) for camera, path in paths.items()}
 
 

@@ -25,7 +25,9 @@ def test_elements_are_near_ten_millimetres_and_two_across() -> None:
 def test_a_written_file_is_read_back(tmp_path: Path) -> None:
     path = tmp_path / "beam.yaml"
     path.write_text(
-        specimen_text(body_of_box("beam", (100.0, 30.0, 30.0), None).with_modulus(123456.0), [MARKER], REMARKS)
+        specimen_text(
+            body_of_box("beam", (100.0, 30.0, 30.0), None).with_material(youngs_modulus=123456.0), [MARKER], REMARKS
+        )
     )
     specimen = read_specimen(path)
     assert specimen.name == "beam"

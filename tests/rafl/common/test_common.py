@@ -6,7 +6,15 @@ from types import SimpleNamespace
 import pytest
 
 from rafl.common.errors import InputError
-from rafl.common.files import atomic_file, new_content, require_writable, sha256, write_bytes, written_files
+from rafl.common.files import (
+    atomic_file,
+    find_copies,
+    new_content,
+    require_writable,
+    sha256,
+    write_bytes,
+    written_files,
+)
 from rafl.common.yaml_files import StrictModel, check_format, read_yaml
 
 
@@ -51,6 +59,16 @@ def test_full_disk_is_told_with_what_was_needed(tmp_path: Path, monkeypatch: pyt
         write_bytes(tmp_path / "new" / "a.h5", bytes(2_000_000))
     assert error.value.filename == str(tmp_path / "new" / "a.h5")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_files_of_one_content_are_found(tmp_path: Path) -> None:
+    contents = {"a": "one", "b": "two", "c": "three", "d": "two"}
+    paths = [tmp_path / name for name in (*contents, "folder")]
+    for path, content in zip(paths, contents.values(), strict=False):
+        path.write_text(content)
+    paths[-1].mkdir()
+    assert find_copies(paths) == (tmp_path / "b", tmp_path / "d")
+    assert find_copies(paths[:3]) is None
 
 
 def test_files_take_their_places_together(tmp_path: Path) -> None:

@@ -1,3 +1,4 @@
+import shutil
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,15 @@ def test_recordings_are_found_by_name(tmp_path: Path) -> None:
     single = Rig({"front": camera()})
     write_video(tmp_path / "swing.mkv", "ffv1", "gray")
     assert set(find_recordings(tmp_path / "swing.mkv", single, Path("calib.yaml"))) == {"swing"}
+
+
+def test_one_video_for_two_cameras_is_refused(tmp_path: Path) -> None:
+    rig = Rig({"left": camera(), "right": camera()})
+    (tmp_path / "one").mkdir()
+    write_video(tmp_path / "one/left.mkv", "ffv1", "gray")
+    shutil.copy(tmp_path / "one/left.mkv", tmp_path / "one/right.mkv")
+    with pytest.raises(InputError, match=r"left\.mkv in .*right\.mkv again; copy the right one"):
+        find_recordings(tmp_path, rig, Path("calib.yaml"))
 
 
 def test_filmed_cameras_are_in_order_with_the_size_of_a_readable_video(tmp_path: Path) -> None:
