@@ -191,7 +191,7 @@ def _reason(shape: Shape, q: Array, dots: Dots) -> str:
             f"moved by about {x:.0f}, {y:.0f}, {z:.0f} mm along x, y, z and turned by {turn:.0f} degrees they would "
             "lie on it, so the world of the recording is not the specimen's frame (origin at the lower corner of the "
             "clamped face on the side of smallest y, x from clamp to tip, z up): calibrate with the board at that "
-            "corner, or set the origin of motion capture there"
+            "corner, or set the origin of motion capture there; or the size of the body is wrong"
         )
     spans = [" x ".join(f"{1e3 * x:.1f}" for x in np.ptp(p, axis=0)) for p in (dots.position, shape.mesh.vertices)]
     return (
