@@ -339,9 +339,12 @@ def _print_results(
     out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int, specimen: Path | None
 ) -> None:
     Console(width=110).print(_summary_table(done))
+    with_note: dict[str, list[str]] = {}
     for name, tracks in done.items():
         for note in tracks.notes:
-            typer.echo(f"note: recording {name}: {note}")
+            with_note.setdefault(note, []).append(name)
+    for note, names in with_note.items():
+        typer.echo(f"note: recording{'s' if len(names) > 1 else ''} {', '.join(names)}: {note}")
     for name, reason in failed.items():
         typer.echo(f"error: recording {name}: {reason}", err=True)
     if kept:

@@ -32,6 +32,10 @@ from rafl.tracking.video.timestamps import (
 
 Array = NDArray[Any]
 
+# Share of the markers that a load or the weight hardly displaces, those near the clamp, and how far they may be from
+# their places [m].
+NEAREST_SHARE, MAX_OFF_PLACE = 0.2, 3e-3
+
 
 @dataclass(frozen=True)
 class TrackingSettings:
@@ -121,6 +125,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         )
     if settings.layout is not None:
         seen = {name for name, known in zip(order, (state == MEASURED).any(axis=0), strict=True) if known}
+        notes += _frame_note(settings.layout, order, position)
         if lost := [name for name in settings.layout.names if name not in seen]:
             notes.append(f"markers {', '.join(lost)} of the specimen were never found")
     for camera, item in followed.items():
@@ -165,6 +170,31 @@ def _perspective_note(rig: Rig, camera: str, position: Array) -> list[str]:
     return [
         f"camera {camera}: its calibration shows perspective, as from {seen.distance:.2f} m away; the orthographic "
         f"model is up to {1e3 * error:.2f} mm wrong, which sigma contains; calibrate with --model pinhole"
+    ]
+
+
+def _frame_note(layout: MarkerLayout, names: list[str], position: Array) -> list[str]:
+    """A note if even the markers nearest to their places in the layout are far from them: the frame is another.
+
+    Args:
+        layout: places on the undeformed specimen.
+        names: of the tracked markers (M).
+        position: [m], (T, M, 3).
+    """
+    places = layout.positions[[layout.names.index(name) for name in names]]
+    off = np.full_like(places, np.nan)
+    seen = np.isfinite(position[..., 0]).any(axis=0)
+    off[seen] = np.nanmedian(position[:, seen], axis=0) - places[seen]
+    distance = np.linalg.norm(off, axis=1)
+    near = distance <= np.nanquantile(distance, NEAREST_SHARE)
+    x, y, z = 1e3 * off[near].mean(axis=0)
+    if distance[near].max() < MAX_OFF_PLACE:
+        return []
+    return [
+        f"even the markers nearest to their places in the specimen file are {x:.1f}, {y:.1f}, {z:.1f} mm off along x, "
+        "y, z: the calibration's world is not the specimen's frame. Check which corner of the board has the position "
+        "in board.yaml (ChArUco: the corner of the print; chessboard: the outermost inner corner), or give "
+        "rafl-capture a recording at rest (--rest)"
     ]
 
 

@@ -4,10 +4,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 from support import draw_frame, write_video
 
 from rafl.calibration.camera import OrthographicCamera, Perspective, Plane
 from rafl.calibration.rig import Rig
+from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.pipeline import TrackingSettings, track_recording
 from rafl.tracking.video.reader import open_video
 
@@ -26,8 +28,8 @@ def moving_dots(path: Path, shown: list[int]) -> None:
     write_video(path, "ffv1", "gray", frames=frames)
 
 
-def notes_of(path: Path, camera: OrthographicCamera) -> str:
-    settings = TrackingSettings(None, None, 3)
+def notes_of(path: Path, camera: OrthographicCamera, layout: MarkerLayout | None = None) -> str:
+    settings = TrackingSettings(layout, None, 3)
     return "; ".join(track_recording({"front": open_video(path)}, Rig({"front": camera}), settings, lambda: None).notes)
 
 
@@ -43,6 +45,20 @@ def test_perspective_is_noted_where_it_makes_an_error(tmp_path: Path) -> None:
     assert "up to 0.05 mm wrong" in note
     far = replace(CAMERA, perspective=Perspective(20.0, -0.008, (99.5, 79.5)))
     assert notes_of(tmp_path / "a.mkv", far) == ""
+
+
+@pytest.mark.parametrize("off_mm", [0.0, 10.0])
+def test_a_world_that_is_not_the_specimens_frame_is_noted(tmp_path: Path, off_mm: float) -> None:
+    moving_dots(tmp_path / "a.mkv", list(range(8)))
+    places = np.array([(4.0 + 3 * i - off_mm, 4.0 + 3.5 * j, 0.0) for i in range(4) for j in range(3)])
+    layout = MarkerLayout(tuple(f"m{k}" for k in range(12)), 1e-3 * places)
+    note = notes_of(tmp_path / "a.mkv", CAMERA, layout)
+    if off_mm:
+        assert note.startswith(
+            "even the markers nearest to their places in the specimen file are 10.7, 0.0, 0.0 mm off"
+        )
+    else:
+        assert note == ""
 
 
 def test_frames_shown_again_are_noted(tmp_path: Path) -> None:
