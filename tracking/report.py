@@ -23,6 +23,7 @@ Array = NDArray[Any]
 
 plt.rcParams["text.parse_math"] = False  # a name with $ is a name
 
+SUSPECT_SIGMAS = 2.0  # a frame is worth a look if its largest sigma is this multiple of the usual one
 MAX_WIDTH_PX = 900  # of a frame in the report
 STATE_COLOURS = ["#c0392b", "#4c9f70", "#e6a23c"]  # missing, measured, filled
 
@@ -51,8 +52,8 @@ Orange: filled. Red: missing.</figcaption></figure>
 <img alt="residuals" src="data:image/png;base64,{{ c.histogram }}">
 {% if c.worst %}<p class="note">The frames with the most missing or least certain markers:</p>
 <div class="strip">{% for w in c.worst %}<figure><img alt="frame" src="data:image/jpeg;base64,{{ w.image }}">
-<figcaption class="note">frame {{ w.number }}: {{ w.seen }} of {{ w.all }} markers seen, largest sigma
-{{ w.sigma }} px</figcaption></figure>{% endfor %}</div>{% endif %}
+<figcaption class="note">frame {{ w.number }}: {{ w.seen }} of the {{ w.all }} markers that this camera sees, largest
+sigma {{ w.sigma }} px</figcaption></figure>{% endfor %}</div>{% endif %}
 {% endfor %}{% endfor %}
 <p class="note">Sigma is one standard deviation of a coordinate, estimated from the fit of each dot.</p></html>
 """
@@ -101,19 +102,23 @@ def _camera_section(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
     first = min(images)
     sigma = tracks.pixel_sigma[name]
     row_of = tracks.rows_by_frame(name)
+    shown = int(np.isfinite(sigma[..., 0]).any(axis=0).sum())
+    largest = np.nan_to_num(sigma).max(axis=(1, 2), initial=0.0)
+    suspect = SUSPECT_SIGMAS * np.median(largest)
     worst = []
     for number in sorted(set(images) & set(row_of) - {first}):
         row = row_of[number]
-        seen = np.isfinite(sigma[row, :, 0])
-        worst.append(
-            {
-                "number": number,
-                "image": _annotated_jpeg(images[number], tracks, pixel, row),
-                "seen": int(seen.sum()),
-                "all": len(seen),
-                "sigma": f"{np.nanmax(sigma[row]):.2f}" if seen.any() else "-",
-            }
-        )
+        seen = int(np.isfinite(sigma[row, :, 0]).sum())
+        if seen < shown or largest[row] > suspect:
+            worst.append(
+                {
+                    "number": number,
+                    "image": _annotated_jpeg(images[number], tracks, pixel, row),
+                    "seen": seen,
+                    "all": shown,
+                    "sigma": f"{largest[row]:.2f}" if seen else "-",
+                }
+            )
     return {
         "name": name,
         "first": _annotated_jpeg(images[first], tracks, pixel, row_of.get(first, 0)),
