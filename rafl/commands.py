@@ -37,7 +37,7 @@ from rafl.fitting.auto import SELECTION_FILE, selection_sentences
 from rafl.fitting.distributed import rank
 from rafl.fitting.fit import fit as fit_model
 from rafl.fitting.methods import DEFAULT_EPOCHS
-from rafl.fitting.quantities import METHOD_QUANTITIES
+from rafl.fitting.quantities import METHOD_QUANTITIES, POISSON
 from rafl.fitting.run_folder import FittedModel, load_model
 from rafl.fitting.sysid import parameter_sentences
 from rafl.fitting.train_field import Report
@@ -153,6 +153,8 @@ def _describe(model: FittedModel) -> str:
             for key in ("youngs_modulus", "poissons_ratio", "viscosity", "branch_shares")
         )
         identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
+        if nu <= POISSON.low * (1.0 + 1e-6):
+            identified += " (the lower bound: check the body's size, density and clamp, and the loads)"
         if viscosity.numel() and viscosity > 0.0:
             identified += f", viscosity = {viscosity:.0f} Pa s"
         if shares.numel():
