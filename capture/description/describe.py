@@ -16,7 +16,7 @@ from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.rigid import MIN_MARKERS, RigidTransform
 from rafl.capture.specimen.geometry import read_surface
 from rafl.capture.specimen.specimen import Body, build_specimen
-from rafl.common.errors import InputError
+from rafl.common.errors import InputError, SimulationError
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.linking.naming import is_row_name
 
@@ -79,9 +79,11 @@ def describe(
         modulus_sigma: standard deviation of log E of the assumed material.
 
     Raises:
-        InputError: the specimen never rests, or its dots are not on the body.
+        InputError: the specimen never rests, its dots are not on the body, or it hangs and should lie flat.
         SimulationError: the body's equilibrium cannot be found.
     """
+    if lying:
+        _check_lying(recording, body, folder, label, modulus_sigma)
     specimen = build_specimen(body, MarkerLayout.of([]), folder, "")
     surface = body.geometry.surface
     shape = Shape(specimen.mesh, None if surface is None else read_surface(folder / surface))
@@ -124,6 +126,19 @@ def describe(
             "(--lying) if it does, or check that no camera has the video or the calibration images of another"
         )
     return Description(shape, dots, names, listed, undeformed, modulus, left_out, modulus_sigma)
+
+
+def _check_lying(recording: Recording, body: Body, folder: Path, label: str, modulus_sigma: float) -> None:
+    """Raise InputError if the dots show the sag of a specimen that hangs."""
+    try:
+        hanging = describe(recording, body, folder, False, label, modulus_sigma)
+    except (InputError, SimulationError):
+        return
+    if hanging.sag_tells:
+        raise InputError(
+            f"{label}: expected the straight rows of a specimen that lies flat, found them bent as if it hung, with a "
+            f"Young's modulus of {1e-3 * hanging.youngs_modulus:.3g} kPa; leave out --lying, or film it again lying"
+        )
 
 
 def _distances(shape: Shape, q: Array, dots: Dots, modulus_sigma: float) -> tuple[Array, Array]:

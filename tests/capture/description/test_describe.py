@@ -71,6 +71,12 @@ def test_a_specimen_that_lies_flat_is_not_bent_back() -> None:
     assert found.youngs_modulus == BODY.material.youngs_modulus
 
 
+@pytest.mark.parametrize("stiffness", [0.7, 1.0, 1.6])
+def test_a_specimen_that_hangs_does_not_lie_flat(stiffness: float) -> None:
+    with pytest.raises(InputError, match=r"found them bent as if it hung, .* leave out --lying"):
+        described(still(SIDES, stiffness), lying=True)
+
+
 def test_a_sag_that_contradicts_the_material_is_refused() -> None:
     with pytest.raises(InputError, match=r"a sag of the assumed material, 216 kPa, .* say that it lies flat"):
         described(still(SIDES, lying=True))
