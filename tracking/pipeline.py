@@ -108,7 +108,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     if settings.sync and len(in_order) > 1:
         offsets = estimate_clock_delays(rig, in_order, times)
         notes += [f"camera {camera}: clock offset {1e3 * s:+.3f} ms, from the motion" for camera, s in offsets.items()]
-    elif len({len(time) for time in times.values()}) > 1:
+    elif len(in_order) > 1:
         offsets, remarks = late_starts(rig, in_order, times)
         notes += remarks
     rig_times = {camera: time - offsets[camera] for camera, time in times.items()}

@@ -145,10 +145,11 @@ def estimate_clock_delays(rig: Rig, pixels: dict[str, CameraPixels], times: dict
 def late_starts(
     rig: Rig, pixels: dict[str, CameraPixels], times: dict[str, Array]
 ) -> tuple[dict[str, float], list[str]]:
-    """Time offsets of cameras [s] that recorded different numbers of frames, and notes.
+    """Time offsets of cameras [s], and notes on cameras that began at different times.
 
-    A camera that stopped earlier than the others has the offset of its calibration. One that began a frame or more
-    later has, in addition, the delay that the motion shows; a smaller delay could be an error of its estimate.
+    Offsets are those of the calibration, and the motion may show others. Where the cameras recorded different numbers
+    of frames, it is believed: some began or stopped at another time. Where the numbers are equal, a note asks. Delays
+    of less than `LEAST_DELAY_FRAMES` could be errors of their estimate.
 
     Args:
         rig: the calibrated cameras.
@@ -158,18 +159,22 @@ def late_starts(
     offsets = {camera: rig.cameras[camera].time_offset for camera in pixels}
     first = next(iter(pixels))
     counts = "the cameras recorded " + ", ".join(f"{len(times[camera])} ({camera})" for camera in pixels) + " frames"
+    alike = len({len(time) for time in times.values()}) == 1
     try:
         found = estimate_clock_delays(rig, pixels, times)
     except InputError:
-        return offsets, [f"{counts}; whether they began together, the motion does not show"]
+        return offsets, [] if alike else [f"{counts}; whether they began together, the motion does not show"]
     notes = []
     for camera, relative in found.items():
         offset = offsets[first] + relative
         frames = (offset - offsets[camera]) * frame_rate(times[camera])
         if abs(frames) > LEAST_DELAY_FRAMES:
-            offsets[camera] = offset
-            order = "later" if frames < 0.0 else "earlier"
-            notes.append(f"{counts}; by the motion, {camera} began {abs(frames):.1f} frames {order}: corrected")
+            began = f"by the motion, {camera} began {abs(frames):.1f} frames {'later' if frames < 0.0 else 'earlier'}"
+            if alike:
+                notes.append(f"{began} than {first}; unless a trigger started them together, track with --sync")
+            else:
+                offsets[camera] = offset
+                notes.append(f"{counts}; {began}: corrected")
     return offsets, notes
 
 

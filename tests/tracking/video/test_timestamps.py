@@ -66,6 +66,18 @@ def test_a_camera_that_began_later_is_found_by_its_missing_frames(random: np.ran
     assert note.endswith("by the motion, askew began 5.0 frames later: corrected")
 
 
+def test_a_camera_that_began_later_and_stopped_later_is_asked_about(random: np.random.Generator) -> None:
+    times = {"side": TIME, "askew": TIME}
+    pixels = {"side": project_with_noise(SIDE, TIME, random), "askew": project_with_noise(ASKEW, TIME + 0.05, random)}
+    offsets, (note,) = late_starts(RIG, pixels, times)
+    assert offsets == {"side": 0.0, "askew": 0.0}
+    assert note.startswith("by the motion, askew began 5.0 frames later than side; unless a trigger")
+    together = {"side": pixels["side"], "askew": project_with_noise(ASKEW, TIME, random)}
+    assert late_starts(RIG, together, times) == ({"side": 0.0, "askew": 0.0}, [])
+    still = {name: project_with_noise(camera, 0 * TIME, random) for name, camera in (("side", SIDE), ("askew", ASKEW))}
+    assert late_starts(RIG, still, times) == ({"side": 0.0, "askew": 0.0}, [])
+
+
 def test_a_camera_that_stopped_earlier_keeps_its_offset(random: np.random.Generator) -> None:
     pixels = {"side": project_with_noise(SIDE, TIME, random), "askew": project_with_noise(ASKEW, TIME[:-5], random)}
     assert late_starts(RIG, pixels, {"side": TIME, "askew": TIME[:-5]}) == ({"side": 0.0, "askew": 0.0}, [])
