@@ -12,6 +12,7 @@ from rafl.common.errors import InputError
 
 Array = NDArray[Any]
 
+MAX_NUMBER = 1e15  # no unit makes any number of a calibration so large
 ROTATION_TOLERANCE = 1e-3  # of R R^T against the identity: matrices are printed with few digits
 MATRIX_TOLERANCE = 1e-9  # of the zeros and the one of an intrinsic matrix, relative to its largest entry
 # The coefficients that follow k1, k2, p1, p2, k3 in OpenCV: the rational, thin prism and tilted models.
@@ -86,6 +87,8 @@ def read_numbers(value: Any, shape: tuple[int, ...], where: str) -> Array:
         raise InputError(f"{expected}, found {_shortened(value)}; export the calibration again") from None
     if not np.isfinite(numbers).all():
         raise InputError(f"{expected}, found some that are not finite; export the calibration again")
+    if (np.abs(numbers) > MAX_NUMBER).any():
+        raise InputError(f"{expected} below {MAX_NUMBER:g}, found others; export the calibration again")
     return numbers
 
 

@@ -4,7 +4,9 @@ import io
 from pathlib import Path
 
 import av
+import cv2
 import numpy as np
+import stereo
 import torch
 import trimesh
 import yaml
@@ -58,6 +60,18 @@ def make_laboratory(folder: Path) -> None:
     )
     _write_motions(folder)
     _write_video(folder)
+    _write_foreign(folder)
+
+
+def _write_foreign(folder: Path) -> None:
+    """Calibrations of other programs, and images."""
+    (folder / "stereo.toml").write_text(stereo.aniposelib_text())
+    stereo.write_opencv(folder / "left.yml", stereo.opencv_values("left"))
+    stereo.write_matlab_stereo(folder / "stereo.mat")
+    stereo.write_dlt(folder / "dlt.csv")
+    image = np.random.default_rng(0).integers(0, 256, (60, 80), dtype=np.uint8)
+    for name in ("board.png", "board.jpg"):
+        cv2.imwrite(str(folder / name), image)
 
 
 def _write_motions(folder: Path) -> None:

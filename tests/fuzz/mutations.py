@@ -391,4 +391,9 @@ BY_SUFFIX: dict[str, dict[str, Mutation]] = {
     ".c3d": BYTES,
     ".mp4": BYTES,
     ".stl": BYTES,
+    ".toml": {**BYTES, **TEXT},
+    ".yml": {**BYTES, **TEXT},
+    ".mat": BYTES,
+    ".png": BYTES,
+    ".jpg": BYTES,
 }

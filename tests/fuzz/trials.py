@@ -14,12 +14,16 @@ from unittest import mock
 
 import click
 import numpy as np
+import stereo
 import typer
 from mutations import BY_SUFFIX, pick
 from support import error_lines
 from typer.testing import CliRunner
 
 from rafl.calibration.board import read_board
+from rafl.calibration.detection.image_file import read_grey_image
+from rafl.calibration.foreign.read import read_any_calibration
+from rafl.calibration.rig import Rig
 from rafl.capture.cli import capture_app
 from rafl.capture.dataset.naming import read_marker_names
 from rafl.capture.specimen.specimen import read_specimen
@@ -31,11 +35,21 @@ from rafl.tracking.cli import track_app
 from rafl.tracking.reconstruction.tracks import read_tracks
 
 APPS = {"rafl-capture": capture_app, "rafl-fit": fit_app, "rafl-eval": eval_app, "rafl-track": track_app}
-READERS = {
+
+
+def read_foreign(path: Path) -> Rig:
+    """The calibration of another program, of cameras that were filmed."""
+    unit = None if path.suffix == ".mat" else "mm"
+    return read_any_calibration(path, unit, lambda count: dict.fromkeys(list(stereo.MATRICES)[:count], stereo.SIZE))
+
+
+READERS: dict[str, Callable[[Path], object]] = {
     "read_specimen": read_specimen,
     "read_board": read_board,
     "read_marker_names": read_marker_names,
     "load_model": load_model,
+    "read_grey_image": read_grey_image,
+    "read_foreign": read_foreign,
 }
 CAPTURE = ("rafl-capture", "small.yaml")
 OUT = ("--recordings", "recordings.csv", "--out", "out/data.h5")
@@ -64,6 +78,12 @@ TARGETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "settings": ("run/config.yaml", ("rafl-fit", "data.h5", *FIT, "run", "--resume")),
     "checkpoint": ("run/checkpoint.pt", ("rafl-fit", "data.h5", *FIT, "run", "--resume")),
     "calibration": ("calib.yaml", ("rafl-track", "videos", "--calib", "calib.yaml", "--specimen", "dots.yaml")),
+    "aniposelib": ("stereo.toml", ("read_foreign", "stereo.toml")),
+    "OpenCV": ("left.yml", ("read_foreign", "left.yml")),
+    "MATLAB": ("stereo.mat", ("read_foreign", "stereo.mat")),
+    "DLT": ("dlt.csv", ("read_foreign", "dlt.csv")),
+    "png": ("board.png", ("read_grey_image", "board.png")),
+    "jpg": ("board.jpg", ("read_grey_image", "board.jpg")),
     "layout": ("dots.yaml", ("rafl-track", "videos", "--calib", "calib.yaml", "--specimen", "dots.yaml")),
     "video": ("videos/take1.mp4", ("rafl-track", "videos", "--calib", "calib.yaml", "--specimen", "dots.yaml")),
 }
