@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from rafl.common.errors import InputError
 from rafl.tracking.detection.appearance import find_markers
 from rafl.tracking.detection.detect import Dots, to_eight_bits
+from rafl.tracking.detection.truncated import with_truncation_error
 from rafl.tracking.linking.late_markers import LateMarker
 from rafl.tracking.linking.repeated_frames import find_repeated_frames
 from rafl.tracking.linking.shape_prior import ShapePrior
@@ -85,7 +86,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
             if found is not None and len(found[1]) >= MIN_MARKERS:
                 tracker = Tracker(*found)
                 noise = noise_fraction(found[1].uncorrelated_residual, found[1].residual)
-                detected = Detections.of(tracker.complete_views.correct(frame.image, found[1]), frame)
+                detected = Detections.of(with_truncation_error(frame.image.shape, found[1]), frame)
         elif frame.image is not None and tracker is not None:
             detected = Detections.of(tracker.advance(frame.image), frame)
             late += tracker.add_late_markers(len(times) - 1, frame.image)

@@ -24,7 +24,7 @@ from rafl.tracking.detection.detect import (
     remove_duplicates,
 )
 from rafl.tracking.detection.partial_occlusion import PartialOcclusion
-from rafl.tracking.detection.truncated import CompleteViews
+from rafl.tracking.detection.truncated import with_truncation_error
 from rafl.tracking.linking.late_markers import LateMarker, LateMarkerFinder
 from rafl.tracking.linking.matching import MarkerPattern, match_markers
 from rafl.tracking.linking.motion_prediction import MotionPredictor
@@ -70,7 +70,6 @@ class Tracker:
         self.sigma = np.zeros(len(first))  # sigma of each marker's position; 0 if identified [px]
         self.frames_since_search = 0
         self.late_markers = LateMarkerFinder(appearance, np.zeros(len(first)))
-        self.complete_views = CompleteViews.empty(len(first))
         self.frame_count = 0  # tracked so far
         self.first_frame = np.zeros(len(first), dtype=np.int64)  # `frame_count` when each marker was added
         self.starts_from_median = np.zeros(len(first), bool)  # markers whose own last disc is a bad start of fits
@@ -99,7 +98,7 @@ class Tracker:
             dots = _restrict(dots, self._identify(dots, unambiguous, guess))
             dots = self._fit_at_shifted(image, dots, expected, guess)
             dots = _restrict(dots, self._identify(dots, unambiguous, guess))
-        dots = self.complete_views.correct(image, dots)
+        dots = with_truncation_error(image.shape, dots)
         self._update(dots, unambiguous, guess)
         return self.partial_occlusion.adjust_sigma(dots, self.pattern.rest)
 
@@ -118,7 +117,6 @@ class Tracker:
             self.prior = self.prior.with_marker(marker.rest)
             self.motion.add_marker(self._last_positions(marker, number))
             self.static_dots.add_marker()
-            self.complete_views.add_marker()
             self.starts_from_median = np.append(self.starts_from_median, False)
             self.first_frame = np.append(self.first_frame, self.frame_count)
             self.partial_occlusion.add_marker()
