@@ -30,9 +30,11 @@ def with_truncation_error(shape: tuple[int, int], dots: Dots) -> Dots:
         shape: height and width of the frame.
         dots: in it.
     """
-    sigma = dots.sigma.copy()
     height, width = shape
     truncated = _are_truncated(dots.parameters, height, width)
+    if not truncated.any():
+        return dots
+    sigma = dots.sigma.copy()
     for row in np.flatnonzero(truncated & _are_irregular(dots)):
         a, b, c = dots.parameters[row, 2:5]
         x, y = np.linalg.solve([[a, b], [b, c]], [np.cos(ANGLES), np.sin(ANGLES)]) + dots.centre[row][:, None]
