@@ -1,5 +1,6 @@
 """Readers of recorded marker positions: tracks, C3D files, tables and npy files."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,8 @@ def find_sources(folder: Path, recording: str) -> list[Path]:
 def read_recording(path: Path, fps: float, unit: str | None = None) -> Recording:
     """Read a tracks file, a C3D file, a table, or a q<i>.npy file of the paper's authors.
 
+    A marker of which a coordinate is missing is missing.
+
     Args:
         path: of the file.
         fps: frames per second of files that do not store it.
@@ -68,7 +71,8 @@ def read_recording(path: Path, fps: float, unit: str | None = None) -> Recording
         _check(recording)
     except ValueError as error:
         raise InputError(f"{path}: {error}; export it again") from None
-    return recording
+    complete = np.isfinite(recording.position).all(axis=2, keepdims=True)
+    return replace(recording, position=np.where(complete, recording.position, np.nan))
 
 
 def _check(recording: Recording) -> None:

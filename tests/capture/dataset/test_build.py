@@ -307,6 +307,16 @@ def test_a_marker_farther_away_than_anything_is_refused(
         build(small_specimen, tmp_path)
 
 
+def test_a_marker_without_one_coordinate_is_missing(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    recorded = 1e3 * truth
+    recorded[4, 2, 1] = np.nan
+    np.save(tmp_path / "q0.npy", recorded)
+    valid = build(small_specimen, tmp_path).trajectories["q0"].valid
+    assert np.argwhere(~valid).tolist() == [[3, 2]]
+
+
 @pytest.mark.parametrize("least", [0.0, 1e-200])
 def test_an_impossible_sigma_is_refused(
     least: float, small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
