@@ -19,6 +19,9 @@ from rafl.common.yaml_files import describe_validation
 MAX_EXPANSION_BYTES = 500_000_000
 BUILT_IN_FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 
+# What h5py and the readers of its content raise for damaged files; SystemError for a name that is no UTF-8.
+DAMAGE = (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError, SystemError)
+
 
 @contextmanager
 def write_hdf5(path: Path, read_back: ReadBack | None = None) -> Iterator[h5py.File]:
@@ -64,7 +67,7 @@ def read_hdf5(path: Path, label: str, advice: str) -> Iterator[h5py.File]:
         raise InputError(
             f"expected {label} in {path}, found that another program has it open; close it there"
         ) from None
-    except (OSError, LookupError, ValueError, TypeError, AttributeError, RuntimeError, ArithmeticError) as error:
+    except DAMAGE as error:
         reason = (
             describe_validation(error) if isinstance(error, pydantic.ValidationError) else " ".join(str(error).split())
         )
