@@ -4,7 +4,7 @@ import datetime
 import hashlib
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import h5py
 import numpy as np
@@ -257,15 +257,26 @@ class _FileAttributes(pydantic.BaseModel):
     substeps: int = pydantic.Field(default=1, ge=1)
 
 
+_Count = Annotated[int, pydantic.Field(ge=0, strict=True)]
+_Measured = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=True)]  # NaN where it was not
+
+
 class _RecordingAttributes(pydantic.BaseModel):
     """Attributes of a recording that are used. Others are kept as they are."""
 
     model_config = pydantic.ConfigDict(extra="allow", allow_inf_nan=False)
 
     split: str
-    load_g: float | None = pydantic.Field(None, ge=0)
-    still_frames: int = pydantic.Field(0, ge=0)
+    load_g: float | None = pydantic.Field(None, ge=0, strict=True)
+    still_frames: _Count = 0
+    first_frame: _Count = 0
+    not_free_frames: _Count = 0
     registration: str = ""
+    bend_modulus: _Measured = float("nan")
+    swing_modulus: _Measured = float("nan")
+    swing_hz: _Measured = float("nan")
+    registration_modulus: _Measured = float("nan")
+    registration_modulus_sigma: _Measured = float("nan")
 
 
 def _read_trajectory(group: h5py.Group, lengths: dict[str, int], label: str) -> Trajectory:
