@@ -14,7 +14,7 @@ INSIDE = {
     "rafl": ["evaluation", "fitting", "residual", "data", "simulation", "solvers", "fem"],
     "tracking": [
         "cli",
-        "commands",
+        "commands|calibration_commands",
         "rest|report|pipeline",
         "overlay",
         "linking",

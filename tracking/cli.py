@@ -87,12 +87,12 @@ def calibrate(
             _check_calibration(calib)
         elif calib_unit:
             raise InputError("expected --calib-unit with --calib or --check only; leave it out")
-        from rafl.tracking import commands
+        from rafl.tracking import calibration_commands
 
         if calib is not None:
-            commands.place_calibration(calib, calib_unit, from_rest, specimen, face or [], out)
+            calibration_commands.place_calibration(calib, calib_unit, from_rest, specimen, face or [], out)
         else:
-            commands.calibrate_from_rest(from_rest, specimen, face or [], tilt_sign or [], out)
+            calibration_commands.calibrate_from_rest(from_rest, specimen, face or [], tilt_sign or [], out)
         return
     assert images is not None
     if specimen or face or calib:
@@ -103,12 +103,12 @@ def calibrate(
         _check_calibration(check)
     elif calib_unit:
         raise InputError("expected --calib-unit with --calib or --check only; leave it out")
-    from rafl.tracking import commands
+    from rafl.tracking import calibration_commands
 
     if check is not None:
-        commands.check_calibration(check, calib_unit, images, board)
+        calibration_commands.check_calibration(check, calib_unit, images, board)
     else:
-        commands.calibrate(images, board, model, tilt_sign or [], 1e-3 * depth_mm, out)
+        calibration_commands.calibrate(images, board, model, tilt_sign or [], 1e-3 * depth_mm, out)
 
 
 def _check_calibration(path: Path) -> None:

@@ -33,7 +33,7 @@ from rafl.tracking.video.timestamps import (
 Array = NDArray[Any]
 
 # Share of the markers that a load or the weight hardly displaces, those near the clamp, and how far they may be from
-# their places [m].
+# their places [m]: as far as `rafl-capture` allows.
 NEAREST_SHARE, MAX_OFF_PLACE = 0.2, 3e-3
 
 
