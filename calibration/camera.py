@@ -167,7 +167,7 @@ class OrthographicCamera(Camera):
             return super().model_error(points, depth_sigma)
         centre = np.asarray(self.perspective.centre)
         depth = points @ self.viewing_direction - self.perspective.depth
-        size = np.sign(depth) * np.hypot(depth, depth_sigma)
+        size = np.copysign(np.hypot(depth, depth_sigma), depth)
         result: Array = (centre - self.project_undistorted(points)) * (size / self.perspective.distance)[..., None]
         return result
 

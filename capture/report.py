@@ -36,10 +36,10 @@ frame. First frame fit: root mean square distance between the markers of the fit
 <h2>Young's modulus</h2>
 <p class="note">Each recording shows it twice: by the bend under the load that was released, and by the frequency of the
 swing. The two depend on different quantities: the load, or the frame rate and the density. Both take Poisson's ratio
-{{ ratio }} from the specimen's description, which has a Young's modulus of {{ assumed }} kPa.{% if locking %} Elements
-of <code>integration: {{ locking }}</code> add a resistance to bending that depends on Poisson's ratio and on the size
-of the elements, so the values hold with this ratio on this mesh only. <code>preset: physical</code> gives the
-material's own.{% endif %}</p>
+{{ ratio }} from the specimen's description, which has a Young's modulus of {{ assumed }} kPa.
+{% if integration != "enhanced" %}Elements of <code>integration: {{ integration }}</code> add a resistance to bending
+that depends on Poisson's ratio and on the size of the elements, so the values hold with this ratio on this mesh only.
+<code>preset: physical</code> gives the material's own.{% endif %}</p>
 <table><tr><th>recording</th><th>bend [kPa]</th><th>swing [kPa]</th><th>frequency [Hz]</th></tr>
 {% for row in moduli %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 <h2>First frames</h2>
@@ -89,9 +89,7 @@ def dataset_page(specimen: Specimen, dataset: Dataset) -> str:
             places=_places(dataset.markers),
             assumed=f"{1e-3 * dataset.simulator.material.youngs_modulus:.3g}",
             ratio=f"{dataset.simulator.material.poissons_ratio:g}",
-            locking=""
-            if dataset.simulator.material.integration == "enhanced"
-            else dataset.simulator.material.integration,
+            integration=dataset.simulator.material.integration,
             moduli=[_moduli(name, item.attributes) for name, item in items.items()],
             registrations=[_registration(name, item.attributes) for name, item in items.items()],
         )

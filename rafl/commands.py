@@ -1,5 +1,6 @@
 """What `rafl-fit` and `rafl-eval` do once their options are checked: call the library, print and write the results."""
 
+import math
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -153,7 +154,7 @@ def _describe(model: FittedModel) -> str:
             for key in ("youngs_modulus", "poissons_ratio", "viscosity", "branch_shares")
         )
         identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
-        if nu <= POISSON.low * (1.0 + 1e-6):
+        if math.isclose(nu, POISSON.low):
             identified += " (the lower bound: check the body's size, density and clamp, and the loads)"
         if viscosity.numel() and viscosity > 0.0:
             identified += f", viscosity = {viscosity:.0f} Pa s"

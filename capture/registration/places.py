@@ -52,9 +52,9 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
 
         sum |x - target|^2 / (sigma^2 + R model_sigma^2) + sum |moved|^2 / prior_sigma^2 + the forces' prior + E's prior
 
-    with R recordings, and a model_sigma that follows from the deflection (`MODEL_FRACTION`). The forces are eliminated
-    recording by recording. A pose and an unknown force can hardly be told apart, nor then can E;
-    known loads decide (`FirstFrame.load`).
+    with R recordings, and a model_sigma of each that follows from its deflection (`MODEL_FRACTION`). The forces are
+    eliminated recording by recording. A pose and an unknown force can hardly be told apart, nor then can E; known loads
+    decide (`FirstFrame.load`).
 
     Args:
         frames: observations, with the markers embedded at their places in the layout.
@@ -69,8 +69,8 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
     count, log_modulus, markers = len(layout.names), 0.0, layout
     moved = np.zeros((count, 3))
     fits: list[LinearFit | None] = [None] * len(frames)
-    until_known = MODEL_FRACTION * float(np.ptp(layout.rest, axis=0).max())  # until the deflection is known
-    model_sigma = np.full(len(frames), until_known)
+    longest = float(np.ptp(layout.rest, axis=0).max())
+    model_sigma = [MODEL_FRACTION * longest] * len(frames)  # until the deflections are known
     by_place = np.repeat(np.maximum(prior_sigma, MIN_PRIOR_SIGMA) ** -2.0, 3)
     # A pose that no frame depends on stays as it is.
     by_pose = np.zeros(6) if any(unknown) else np.ones(6)
@@ -84,14 +84,14 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
             current = replace(frame, simulator=softened, markers=markers)
             if unknown[k]:
                 current = replace(current, target=pose.apply(frame.target))
-            fit = fit_linear_forces(current, float(model_sigma[k]), fits[k])
+            fit = fit_linear_forces(current, model_sigma[k], fits[k])
             fits[k] = fit
             own_hessian, own_gradient = _reduced_normal_equations(current, fit, unknown[k])
             hessian += own_hessian
             gradient += own_gradient
             deflection = markers.positions(torch.from_numpy(fit.q)).numpy() - markers.rest
             size = float(np.sqrt(np.mean((deflection**2).sum(-1))))
-            model_sigma[k] = np.sqrt(len(frames)) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
+            model_sigma[k] = float(np.sqrt(len(frames))) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
         covariance = _inverse(hessian)
         step = -covariance @ gradient
         step *= min(1.0, MAX_MODULUS_STEP / max(abs(step[0]), MAX_MODULUS_STEP))

@@ -7,8 +7,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+# Until an interruption that was lost is repeated [s]: Python has then left the code that cannot raise it.
 REPEAT_AFTER = 0.01
-"""Seconds until an interruption that was lost is repeated: Python has then left the code that cannot raise it."""
 
 
 class Terminated(KeyboardInterrupt):

@@ -2,6 +2,7 @@
 
 import datetime
 import hashlib
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -257,8 +258,14 @@ class _FileAttributes(pydantic.BaseModel):
     substeps: int = pydantic.Field(default=1, ge=1)
 
 
+def _positive_or_nan(value: float) -> float:
+    if not (math.isnan(value) or 0.0 < value < math.inf):
+        raise ValueError("expected a number above 0, or nan where nothing was measured")
+    return value
+
+
 _Count = Annotated[int, pydantic.Field(ge=0, strict=True)]
-_Measured = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=True)]  # NaN where it was not
+_Measured = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=True), pydantic.AfterValidator(_positive_or_nan)]
 
 
 class _RecordingAttributes(pydantic.BaseModel):

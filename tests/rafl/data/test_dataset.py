@@ -278,6 +278,24 @@ def test_inconsistent_parts_are_neither_written_nor_read(
         read_dataset(path)
 
 
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("load_g", True), ("load_g", -1.0), ("first_frame", 1.5), ("bend_modulus", 0.0), ("swing_modulus", np.inf)],
+)
+def test_attributes_that_are_no_such_numbers_are_refused(
+    dataset: Dataset, tmp_path: Path, key: str, value: object
+) -> None:
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    with h5py.File(path, "r+") as file:
+        file["trajectories/a"].attrs["bend_modulus"] = np.nan
+    read_dataset(path)
+    with h5py.File(path, "r+") as file:
+        file["trajectories/a"].attrs[key] = value
+    with pytest.raises(InputError, match=f"which cannot be read: {key}: "):
+        read_dataset(path)
+
+
 KILL_WRITERS = """
 import os, random, signal, sys, time
 from dataclasses import replace
