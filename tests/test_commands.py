@@ -5,15 +5,12 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import h5py
 import numpy as np
 import pytest
 from stills import SIDES, still
-from support import Run, assert_refused, draw_frame
+from support import Run, assert_refused, folder_content
 
-from rafl.calibration.camera import OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, write_calibration
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
@@ -31,67 +28,11 @@ from rafl.residual.global_residual import GlobalResidual
 COMMANDS = ("rafl-render", "rafl-calibrate", "rafl-track", "rafl-specimen", "rafl-capture", "rafl-fit", "rafl-eval")
 
 
-def folder_content(folder: Path) -> set[str]:
-    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
-
-
 @pytest.mark.parametrize("command", COMMANDS)
 def test_help_has_an_example(command: str, run: Run) -> None:
     result = run(command, "--help")
     assert result.returncode == 0
     assert f"Example: {command} " in " ".join(result.stdout.split())
-
-
-@pytest.fixture
-def videos(tmp_path: Path) -> Path:
-    """Folder with one recording of one camera: images of a 4 x 3 marker grid that moves by 1 px per frame."""
-    folder = tmp_path / "videos" / "swing"
-    folder.mkdir(parents=True)
-    for frame in range(6):
-        dots = [(40 + 36 * i + frame, 40 + 36 * j, 6.0, 6.0, 0.0) for i in range(4) for j in range(3)]
-        cv2.imwrite(str(folder / f"{frame:03d}.png"), draw_frame(dots, noise=1.0, seed=frame))
-    write_calibration(tmp_path / "calib.yaml", Rig({"front": camera()}))
-    return tmp_path / "videos"
-
-
-def camera(size: tuple[int, int] = (200, 160)) -> OrthographicCamera:
-    return OrthographicCamera(
-        image_size=size, scale=(1e4, 1e4), rotation_vector=(0.0, 0.0, 0.0), plane=Plane((0.0, 0.0, 1.0), 0.0, 5e-4)
-    )
-
-
-def test_track_a_folder_of_images(videos: Path, run: Run, tmp_path: Path) -> None:
-    result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--overlay")
-    assert result.returncode == 0, result.stderr
-    with h5py.File(tmp_path / "tracks/swing.h5") as file:
-        assert list(file.attrs["marker_names"]) == [f"r{j}c{i}" for j in (1, 2, 3) for i in (1, 2, 3, 4)]
-        np.testing.assert_allclose(file["time"][()], np.arange(6) / 50)
-        moved = file["position"][5] - file["position"][0]
-        np.testing.assert_allclose(moved, np.broadcast_to([5e-4, 0, 0], moved.shape), atol=5e-6)
-        assert (file["state"][()] == 1).all()
-    assert (tmp_path / "tracks/swing_front_overlay.mp4").stat().st_size > 1000
-
-
-def test_track_refuses_wrong_input(videos: Path, run: Run, tmp_path: Path) -> None:
-    before = folder_content(tmp_path)
-
-    def refused(*parts: str, calib: str = "calib.yaml", path: Path = videos, more: tuple[str, ...] = ()) -> None:
-        result = run("rafl-track", path, "--calib", calib, *(more or ("--fps", "50")))
-        assert_refused(result, *parts)
-        assert folder_content(tmp_path) - set(extra) == before
-
-    extra = {"other.yaml", "videos/swing/broken.png"}
-    refused("nowhere.yaml", "check the path", calib="nowhere.yaml")
-    refused("nothing", path=tmp_path / "nothing")
-    refused(".mp4", "calib.yaml, found another file type", path=tmp_path / "calib.yaml")
-    write_calibration(tmp_path / "other.yaml", Rig({"front": camera((640, 480))}))
-    refused("swing", "expected 640 x 480", "found 200 x 160", calib="other.yaml")
-    write_calibration(tmp_path / "other.yaml", Rig({"left": camera(), "right": camera()}))
-    refused("other.yaml (left, right)", "'swing'", calib="other.yaml")
-    (tmp_path / "other.yaml").write_text("cameras: []")
-    refused("other.yaml", calib="other.yaml")
-    refused("--fps", more=("--fill", "3"))
-    refused("--export", "'xlsx'", more=("--fps", "50", "--export", "csv,xlsx"))
 
 
 def write_still(path: Path, size_factor: float = 1.0) -> None:
@@ -146,52 +87,6 @@ def test_a_stencil_comes_with_its_specimen(run: Run, tmp_path: Path) -> None:
     specimen = read_specimen(tmp_path / "dots.yaml")
     assert len(specimen.layout.names) == 50
     assert (tmp_path / "dots.pdf").read_bytes().startswith(b"%PDF")
-
-
-def test_damaged_image_is_reported_and_its_markers_are_missing(videos: Path, run: Run, tmp_path: Path) -> None:
-    (videos / "swing" / "003.png").write_bytes(b"not an image")
-    result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--fill", "0")
-    assert result.returncode == 0, result.stderr
-    assert "frames 3 are damaged" in result.stdout
-    with h5py.File(tmp_path / "tracks/swing.h5") as file:
-        assert (file["state"][()] == 1).all(axis=1).tolist() == [True, True, True, False, True, True]
-        assert (file["state"][3] == 0).all()
-
-
-def test_recordings_are_tracked_again_only_if_something_changed(videos: Path, run: Run, tmp_path: Path) -> None:
-    command = ("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--export", "csv,c3d,trc,npy")
-    assert run(*command).returncode == 0
-    path = tmp_path / "tracks/swing.h5"
-    first, time = path.read_bytes(), path.stat().st_mtime_ns
-    again = run(*command)
-    assert "kept the tracks of 1 recordings" in again.stdout
-    assert path.stat().st_mtime_ns == time
-    # A damaged tracks file, or one with other settings, is not kept.
-    path.write_bytes(first[: len(first) // 2])
-    assert "kept" not in run(*command).stdout
-    assert path.read_bytes() == first
-    assert "kept" not in run(*command, "--fill", "1").stdout
-    exports = {"report.html", "swing.h5", "swing.csv", "swing.c3d", "swing.trc", "q0.npy"}
-    assert {item.name for item in (tmp_path / "tracks").iterdir()} == exports
-
-
-def test_track_refuses_too_few_markers(videos: Path, run: Run, tmp_path: Path) -> None:
-    for path in (videos / "swing").iterdir():
-        cv2.imwrite(str(path), draw_frame([(60.0, 60.0, 6.0, 6.0, 0.0), (120.0, 60.0, 6.0, 6.0, 0.0)], noise=1.0))
-    result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50")
-    assert_refused(result, "swing", "at least 3 dots", "found 2")
-    assert not (tmp_path / "tracks").exists()
-
-
-def test_other_recordings_are_tracked_after_a_failure(videos: Path, run: Run, tmp_path: Path) -> None:
-    blank = videos / "blank"
-    blank.mkdir()
-    for frame in range(3):
-        cv2.imwrite(str(blank / f"{frame}.png"), np.full((160, 200), 90, np.uint8))
-    result = run("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50")
-    assert result.returncode == 1
-    assert "error: recording blank" in result.stderr
-    assert {path.name for path in (tmp_path / "tracks").iterdir()} == {"report.html", "swing.h5"}
 
 
 @pytest.fixture(scope="module")

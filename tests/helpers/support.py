@@ -52,6 +52,11 @@ def error_lines(stderr: str) -> list[str]:
     return [line for line in stderr.splitlines() if line.strip() and line != MESSAGE]
 
 
+def folder_content(folder: Path) -> set[str]:
+    """Paths of everything in a folder, relative to it."""
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
 def assert_refused(result: subprocess.CompletedProcess[str], *parts: str) -> None:
     """Assert exit code 2 and exactly one line on standard error, an error message that contains all parts."""
     assert result.returncode == 2, result.stdout + result.stderr
