@@ -56,7 +56,9 @@ def draw_specimens(mesh: HexMesh, frames: list[tuple[str, Array, Array]]) -> str
             1e3 * q[mesh.surface], facecolor="#9bc1e3", edgecolor="#3b6f9e", linewidth=0.4, alpha=0.35
         )
         axes.add_collection3d(surface)
-        axes.scatter(*(1e3 * markers[np.isfinite(markers[:, 0])].T), color="#c0392b", s=6, depthshade=False)
+        axes.computed_zorder = False  # else the surface, in front or not, is drawn over all markers
+        known = 1e3 * markers[np.isfinite(markers[:, 0])]
+        axes.scatter(*known.T, color="#c0392b", s=6, depthshade=False, zorder=surface.zorder + 1)
     return encode_png(figure)
 
 
