@@ -26,8 +26,7 @@ FROM_REPORTS = {
     "dataset-first-frames": ("canonical.html", 1),
     "error-over-time": ("run/report.html", 0),
     "marker-trajectory": ("run/report.html", 1),
-    "bodies": ("run/report.html", -2),
-    "residual-forces": ("run/report.html", -1),
+    "bodies": ("run/report.html", -1),
 }
 
 
@@ -54,7 +53,7 @@ def motion(demo: Path) -> Image.Image:
     axes.plot(recorded.time, 1e3 * recorded.markers[:, tip, 2], "k.", markersize=5, label="recorded marker")
     for label, model, style in (
         ("baseline simulator", None, "C1--"),
-        ("with the trained field", rafl.load_model(demo / "run"), "C0-"),
+        ("fitted model", rafl.load_model(demo / "run"), "C0-"),
     ):
         simulated = rafl.simulate(dataset, model, [name])[name]
         axes.plot(simulated.time, 1e3 * simulated.markers[:, tip, 2], style, label=label)
