@@ -25,7 +25,7 @@ MIN_CONTRAST = 12.0  # grey levels
 MODEL_ERROR = 1e-3  # px: error of the centre that the disc model itself causes
 CORRELATED_VARIANCE_RATIO = 1.25  # block variance over that of independent errors, above which errors are correlated
 MIN_DOTS_FOR_TWO_THREADS = 64  # with fewer dots, decoding takes longer than fitting
-STATISTIC_COUNT = 11  # statistics of one fit, see `_describe`
+STATISTIC_COUNT = 10  # statistics of one fit, see `_describe`
 MIN_DOWNSAMPLED_RADIUS = 1.9  # px: radius of the smallest dots that the fast search finds in a downsampled frame
 MIN_SEPARATION_RADII = 0.6  # radii: two detections closer than this are the same dot
 RELATIVE_CONTRAST_TOLERANCE = 0.2  # logarithm: dots of less different relative contrast may be alike in any light
@@ -51,7 +51,6 @@ class Dots:
             sqrt(sum over pixels k of (d centre / d level_k)^2) [px per grey level], (D, 2).
         residual: root mean square residual over |contrast|, (D).
         misfit: the same without the pixel noise, which is estimated only where the residual is large, (D).
-        uncorrelated_residual: the same of the part that neighbouring pixels do not share, (D).
         mean_weight: of the pixels in the fit, 0 to 1, (D).
     """
 
@@ -65,7 +64,6 @@ class Dots:
     noise_gain: Array
     residual: Array
     misfit: Array
-    uncorrelated_residual: Array
     mean_weight: Array
 
     def __len__(self) -> int:
@@ -100,7 +98,7 @@ class Dots:
         nan = np.full(count, np.nan)
         pair = np.full((count, 2), np.nan)
         parameters = np.full((count, PARAMETER_COUNT), np.nan)
-        return cls(pair, pair.copy(), parameters, nan, nan, nan, nan, pair.copy(), nan, nan, nan, nan)
+        return cls(pair, pair.copy(), parameters, nan, nan, nan, nan, pair.copy(), nan, nan, nan)
 
 
 @njit(cache=True)
@@ -137,15 +135,13 @@ def _fit_range(
 def _describe(p: Array, quality: Array, statistics: Array) -> None:
     """Fill the statistics of one fit, defined in `Dots`, from its parameters and its quality.
 
-    In order: sigma (2), noise gain (2), radius, axis ratio, residual, mean weight, relative radius sigma, misfit,
-    uncorrelated residual.
+    In order: sigma (2), noise gain (2), radius, axis ratio, residual, mean weight, relative radius sigma, misfit.
     """
     statistics[0:2] = np.nan
     statistics[2], statistics[3] = np.sqrt(quality[1]), np.sqrt(quality[2])
     statistics[4], statistics[5], statistics[8] = np.nan, 0.0, np.nan
     statistics[6], statistics[7] = np.sqrt(quality[5]) / max(abs(p[8]), 1e-12), quality[6]
     statistics[9] = np.sqrt(quality[5] - quality[10]) / max(abs(p[8]), 1e-12)
-    statistics[10] = np.sqrt(quality[11]) / max(abs(p[8]), 1e-12)
     determinant = p[2] * p[4] - p[3] * p[3]
     mean = 0.5 * (p[2] + p[4])
     if not (quality[0] > 0.0 and determinant > 0.0 and mean > 0.0):
@@ -190,7 +186,6 @@ def fit_dots(image: Array, starts: Array, fit_count: int | None = None, robust: 
         noise_gain=statistics[:, 2:4],
         residual=statistics[:, 6],
         misfit=statistics[:, 9],
-        uncorrelated_residual=statistics[:, 10],
         mean_weight=statistics[:, 7],
     )
 

@@ -162,7 +162,6 @@ def _fit(image, p, near, robust, w, quality):
         p[5], p[6], p[7] = p[5] + p[6] ** 2 / 12.0, p[6] * p[7] / 12.0, p[5] + p[7] ** 2 / 12.0
     if quality[5] > (MIN_NOISE_RESIDUAL * p[8]) ** 2:
         quality[10] = min(_pixel_noise(RESIDUAL, count, w) ** 2, quality[5])
-    quality[11] = _uncorrelated_variance(count, w)
     quality[0] = 1.0
     return False
 
@@ -240,22 +239,6 @@ def _pixel_noise(row, count, w):
         w[WORK + found] = abs(w[row + k] - w[row + k - 1])
         found += int(beside)
     return 1.4826 / np.sqrt(2.0) * np.median(w[WORK : WORK + max(found, 1)])
-
-
-@njit(**FAST)
-def _uncorrelated_variance(count, w):
-    """Variance of the part of the residual that horizontally adjacent pixels do not share, weighted by their weights.
-
-    It is half the mean squared difference of adjacent pixels' residuals.
-    """
-    count = min(count, MAX_PIXELS)
-    square, pairs = np.float32(0.0), np.float32(0.0)
-    for k in range(1, count):
-        beside = (w[Y + k] == w[Y + k - 1]) & (w[X + k] - w[X + k - 1] < np.float32(2.5))
-        weight = w[WEIGHT + k] * w[WEIGHT + k - 1] if beside else np.float32(0.0)
-        square += weight * (w[RESIDUAL + k] - w[RESIDUAL + k - 1]) ** 2
-        pairs += weight
-    return 0.5 * square / max(pairs, np.float32(1.0))
 
 
 @njit(**STRICT)

@@ -26,9 +26,8 @@ from rafl.tracking.detection.normal_equations import add_scores, factorise, norm
 # 3, 4: the same by the residuals summed over blocks of pixels [px^2]; 5: mean squared residual; 6: mean weight;
 # 7, 8: shift of the centre by the pixels of reduced weight [px];
 # 9: variance of A's mean diagonal for independent errors of one grey level;
-# 10: variance of the pixel noise, estimated only where the residual is large;
-# 11: variance of the part of the residual that neighbouring pixels do not share.
-QUALITY_COUNT = 12
+# 10: variance of the pixel noise, estimated only where the residual is large.
+QUALITY_COUNT = 11
 # A step within these three limits leaves the normal matrix nearly unchanged.
 SMALL_SHIFT = 1.0  # px: of the centre
 SMALL_RADIUS_CHANGE = 0.3  # px

@@ -18,15 +18,13 @@ from rafl.tracking.linking.late_markers import LateMarker
 from rafl.tracking.linking.repeated_frames import find_repeated_frames
 from rafl.tracking.linking.shape_prior import ShapePrior
 from rafl.tracking.linking.tracker import MIN_SHAPES, Tracker
-from rafl.tracking.reconstruction.uncertainty import filtered_positions, noise_fraction
-from rafl.tracking.video.frame import Frame
+from rafl.tracking.reconstruction.uncertainty import with_error_floor
 from rafl.tracking.video.reader import Video
 
 Array = NDArray[Any]
 
 MIN_MARKERS = 3
 WORST_FRAME_COUNT = 10  # frames whose images are kept for the report
-NO_POSITIONS = np.empty((0, 2))
 
 
 @dataclass(frozen=True)
@@ -35,8 +33,7 @@ class PixelTracks:
 
     Attributes:
         time: [s], (T), NaN where the video gives none.
-        pixel: positions [px], (T, D, 2), NaN where not measured. If the quantisation step is known, they are corrected
-            by the other markers' motion.
+        pixel: positions [px], (T, D, 2), NaN where not measured.
         sigma: along x and y [px], (T, D, 2).
         start: positions in the first frame that shows markers [px], (D, 2); predicted for late-detected markers.
         late_count: number of late-detected markers, which are the last ones.
@@ -72,23 +69,21 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
     late: list[LateMarker] = []
     damaged: list[bool] = []
     max_dots = 0
-    noise = 1.0
     tracker: Tracker | None = None
     worst_frames = _WorstFrames()
     reading = video.read()
     for frame in reading:
         times.append(frame.time)
         damaged.append(frame.image is None)
-        detected = Detections(NO_POSITIONS, NO_POSITIONS, NO_POSITIONS, NO_POSITIONS[:, 0], frame.lag_factor)
+        detected = NO_MARKERS
         if frame.image is not None and tracker is None:
             found = find_markers(frame.image)
             max_dots = max(max_dots, 0 if found is None else len(found[1]))
             if found is not None and len(found[1]) >= MIN_MARKERS:
                 tracker = Tracker(*found)
-                noise = noise_fraction(found[1].uncorrelated_residual, found[1].residual)
-                detected = Detections.of(with_truncation_error(frame.image.shape, found[1]), frame)
+                detected = Detections.of(with_truncation_error(frame.image.shape, found[1]))
         elif frame.image is not None and tracker is not None:
-            detected = Detections.of(tracker.advance(frame.image), frame)
+            detected = Detections.of(tracker.advance(frame.image))
             late += tracker.add_late_markers(len(times) - 1, frame.image)
         elif tracker is not None:
             tracker.skip_frame()
@@ -105,7 +100,8 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
         )
     with ThreadPoolExecutor(1) as background:
         images = background.submit(worst_frames.encode)
-        pixel, sigma = filtered_positions(*_assemble(detections, late, len(tracker.pattern.rest)), noise)
+        pixel, fit_sigma = _assemble(detections, late, len(tracker.pattern.rest))
+        sigma = with_error_floor(pixel, fit_sigma, video.predicted_frames)
     start = tracker.pattern.rest
     if late:
         is_late = np.arange(len(start)) >= len(start) - len(late)
@@ -132,43 +128,30 @@ class Detections:
     Attributes:
         pixel: positions [px], (D, 2), NaN where not visible.
         sigma: from the fits [px], (D, 2), NaN where not visible.
-        noise_gain: see `Dots`, (D, 2).
-        step: quantisation step at the marker [grey levels], (D), NaN where not known.
-        lag_factor: see `Frame`.
     """
 
     pixel: Array
     sigma: Array
-    noise_gain: Array
-    step: Array
-    lag_factor: float
 
     @classmethod
-    def of(cls, dots: Dots, frame: Frame) -> "Detections":
+    def of(cls, dots: Dots) -> "Detections":
         """From the dots of a frame; those without a sigma are not visible."""
-        pixel = np.where(np.isfinite(dots.sigma), dots.centre, np.nan)
-        return cls(pixel, dots.sigma, dots.noise_gain, frame.quantisation_step_at(pixel), frame.lag_factor)
+        return cls(np.where(np.isfinite(dots.sigma), dots.centre, np.nan), dots.sigma)
 
 
-def _assemble(
-    detections: list[Detections], late: list[LateMarker], count: int
-) -> tuple[Array, Array, Array, Array, Array]:
-    """The first arguments of `filtered_positions`, for all `count` markers; the late-detected ones are the last.
+NO_MARKERS = Detections(np.empty((0, 2)), np.empty((0, 2)))
 
-    Returns:
-        Positions, sigma and noise gain, (T, D, 2), quantisation steps, (T, D), and lag factors, (T). All but the last
-        are NaN where not measured.
-    """
-    pixel, sigma, noise_gain = np.full((3, len(detections), count, 2), np.nan)
-    step = np.full((len(detections), count), np.nan)
+
+def _assemble(detections: list[Detections], late: list[LateMarker], count: int) -> tuple[Array, Array]:
+    """Positions and sigmas of all `count` markers [px], (T, D, 2), NaN where not measured; late-detected ones last."""
+    pixel, sigma = np.full((2, len(detections), count, 2), np.nan)
     for frame, detected in enumerate(detections):
         known = len(detected.pixel)
         pixel[frame, :known], sigma[frame, :known] = detected.pixel, detected.sigma
-        noise_gain[frame, :known], step[frame, :known] = detected.noise_gain, detected.step
     for column, marker in enumerate(late, start=count - len(late)):
         for frame, (position, position_sigma) in marker.seen.items():
             pixel[frame, column], sigma[frame, column] = position, position_sigma
-    return pixel, sigma, noise_gain, step, np.array([detected.lag_factor for detected in detections])
+    return pixel, sigma
 
 
 def _predict_late_starts(start: Array, pixel: Array, late: NDArray[np.bool_], static: NDArray[np.bool_]) -> Array:

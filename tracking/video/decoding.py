@@ -18,7 +18,6 @@ from rafl.common.errors import InputError
 from rafl.tracking.video.ffmpeg import DecodingResult, FFmpegDecoder, luma_bytes, open_container, read_packets
 from rafl.tracking.video.frame import Frame
 from rafl.tracking.video.frame_order import DecodedPacket, FrameOrder
-from rafl.tracking.video.hevc import HevcDecoder
 from rafl.tracking.video.jpeg import JpegDecoder
 from rafl.tracking.video.nal_units import NalUnits, RandomAccessPoints
 from rafl.tracking.video.prefetch import prefetch
@@ -72,13 +71,10 @@ def _decoded_packets(path: Path, notes: list[str]) -> Generator[DecodedPacket]:
         stream = container.streams.video[0]
         results = stack.enter_context(closing(_decoding_results(path, container, stream, notes)))
         extradata = stream.codec_context.extradata
-        units = NalUnits.of("h264", extradata) if stream.codec_context.codec.name == "h264" else None
-        access_points, reports_all_damage = None if units is None else RandomAccessPoints(units), units is not None
+        units = NalUnits.of(extradata) if stream.codec_context.codec.name == "h264" else None
+        access_points = None if units is None else RandomAccessPoints(units)
         for packet, frames, damaged in results:
             timestamp = packet.pts if packet.size else None
-            if units is not None and packet.size:
-                # Of several slices one may be lost without a report.
-                reports_all_damage = reports_all_damage and units.count_slices(bytes(packet)) == 1
             if access_points is None:
                 refresh_packets = 0 if packet.is_keyframe else None
             else:
@@ -91,7 +87,6 @@ def _decoded_packets(path: Path, notes: list[str]) -> Generator[DecodedPacket]:
                 damaged,
                 refresh_packets or 0,
                 lacks_timestamp=packet.size > 0 and timestamp is None,
-                reports_all_damage=reports_all_damage,
             )
 
 
@@ -101,7 +96,7 @@ def _decoding_results(
     """Yield a file's packets and what they decode to; as much of the work as possible runs in other threads."""
     codec = stream.codec_context.codec
     packets = read_packets(container, stream, notes)
-    if not codec.intra_only and codec.name != "hevc":
+    if not codec.intra_only:
         # The only decoder has a thread to itself; any other work there would delay it.
         decoder = FFmpegDecoder(stream)
         decoded = ((packet, *decoder.decode_packet(packet)) for packet in packets)
@@ -109,13 +104,10 @@ def _decoding_results(
             yield from starmap(decoder.convert, items)
         return
     with ExitStack() as stack:
-        count = min(MAX_DECODERS, os.cpu_count() or 1, _useful_decoder_count(path)) if codec.intra_only else 1
+        count = min(MAX_DECODERS, os.cpu_count() or 1, _useful_decoder_count(path))
         decoders: list[Decoder]
         if codec.name == "mjpeg" and (jpeg := JpegDecoder.of(path)) is not None:
             decoders = [jpeg.decode] * count
-        elif codec.name == "hevc":
-            cores = os.cpu_count() or 1
-            decoders = [HevcDecoder.of(stream, stack.enter_context(ThreadPoolExecutor(cores)), cores).decode]
         else:
             streams = [stream]
             streams += [stack.enter_context(open_container(path)).streams.video[0] for _ in range(1, count)]

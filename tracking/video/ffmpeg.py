@@ -1,6 +1,5 @@
 """Decode packets of a video with FFmpeg, set up to report damage."""
 
-import gc
 import logging
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,19 +11,18 @@ from numpy.typing import NDArray
 
 from rafl.tracking.video.frame import quarter_turns, scale_to_eight_bits
 from rafl.tracking.video.frame_order import DecodedFrame
-from rafl.tracking.video.quantisation import QuantisationReader, quantisation_reader_of
 
 Array = NDArray[Any]
 DecodingResult = tuple["av.packet.Packet", list[DecodedFrame], bool]  # packet, frames it completes, whether damaged
 
-# Decoders report damage only in their log, and with the same words for the next packet; header readers write the header
-# fields there. Nothing of it is passed on to Python's logging.
+# Decoders report damage only in their log, and with the same words for the next packet. Nothing of it is passed on to
+# Python's logging.
 av.logging.set_level(av.logging.INFO)
 av.logging.set_skip_repeated(False)
 logging.getLogger("libav").addHandler(logging.NullHandler())
 logging.getLogger("libav").propagate = False
-# Decoders report damage instead of concealing it, and export the quantisation steps.
-DECODER_OPTIONS = {"err_detect": "crccheck+bitstream+buffer+explode", "export_side_data": "venc_params"}
+# Decoders report damage instead of concealing it.
+DECODER_OPTIONS = {"err_detect": "crccheck+bitstream+buffer+explode"}
 # With this message H.264's decoder reports an incomplete image at once; it marks the image only when it outputs it.
 CONCEALMENT_MESSAGE = "concealing"
 # Encoders of these codecs never write four zero bytes if the file has length fields; lost disk sectors consist of them.
@@ -42,11 +40,9 @@ class FFmpegDecoder:
         # AV1 decoders check the ends of the code only in strict mode.
         self.context.options = DECODER_OPTIONS | ({"strict": "1"} if "av1" in self.context.codec.name else {})
         self.copies = self.context.codec.intra_only
-        self.quantisation = quantisation_reader_of(stream)
         has_lengths = (self.context.extradata or b"").startswith(b"\1")
         self.checks_zero_runs = self.context.codec.name in ZERO_RUN_CODECS and has_lengths
         self.started = False
-        self.frame_number = 0
 
     def decode(self, packets: list["av.packet.Packet"]) -> list[DecodingResult]:
         """Decode the next packets: each with the frames that it completes, and whether it is damaged."""
@@ -54,15 +50,13 @@ class FFmpegDecoder:
         return [self.convert(*each) for each in [(packet, *self.decode_packet(packet)) for packet in packets]]
 
     def convert(self, packet: "av.packet.Packet", frames: list["av.VideoFrame"], damaged: bool) -> DecodingResult:
-        """Extract images and quantisation steps from the next packet's frames; any one thread may do this.
+        """Extract images from the next packet's frames; any one thread may do this.
 
         Args:
             packet: the packet.
             frames: those that it completes; the list is emptied.
             damaged: whether the decoder reported damage.
         """
-        if self.quantisation is not None:
-            self.quantisation.read_packet(packet)
         if self.checks_zero_runs:
             content = bytes(packet)
             # Some programs write zeros after every image.
@@ -70,18 +64,9 @@ class FFmpegDecoder:
             damaged |= self.checks_zero_runs and ZERO_RUN in content
         self.started = True
         converted: list[DecodedFrame] = []
-        ended = packet.size == 0
         while frames:
-            sampled = self.quantisation is not None and self.quantisation.is_sampled(self.frame_number, ended)
-            reader = self.quantisation if sampled else None
-            holds_memory = reader is not None and reader.holds_memory
-            last = ended and len(frames) == 1
-            lag_factor = 1.0 if self.quantisation is None else self.quantisation.lag_factor(frames[0], last)
             # A decoder that needs no earlier frames is faster if its memory is returned to it early.
-            converted.append(_convert_frame(frames.pop(0), self.copies or holds_memory, reader, lag_factor))
-            self.frame_number += 1
-            if holds_memory:
-                gc.collect(0)  # frame and side data refer to each other, and so keep the decoder's memory
+            converted.append(_convert_frame(frames.pop(0), self.copies))
         return packet, converted, damaged
 
     def decode_packet(self, packet: "av.packet.Packet") -> tuple[list["av.VideoFrame"], bool]:
@@ -124,13 +109,8 @@ def read_packets(
         yield packet
 
 
-def _convert_frame(
-    frame: "av.VideoFrame", copy: bool, reader: QuantisationReader | None, lag_factor: float
-) -> DecodedFrame:
-    """Image of a frame, and its quantisation steps if there is a `reader`."""
-    image = None if frame.is_corrupt else grey_image(frame, copy)
-    steps = None if reader is None or image is None else reader.equivalent_steps(frame)
-    return DecodedFrame(frame.pts, image, steps, lag_factor)
+def _convert_frame(frame: "av.VideoFrame", copy: bool) -> DecodedFrame:
+    return DecodedFrame(frame.pts, None if frame.is_corrupt else grey_image(frame, copy))
 
 
 def grey_image(frame: "av.VideoFrame", copy: bool) -> Array:

@@ -24,14 +24,10 @@ class DecodedFrame:
     Attributes:
         timestamp: display time in units of the stream's time base; None if the stream does not say.
         image: see `Frame`; None if damaged.
-        quantisation_steps: see `Frame`.
-        lag_factor: see `Frame`.
     """
 
     timestamp: int | None
     image: Array | None
-    quantisation_steps: Array | None
-    lag_factor: float = 1.0
 
     def image_bytes(self) -> int:
         """Size of the image in memory [bytes]."""
@@ -51,7 +47,6 @@ class DecodedPacket:
         damaged: whether the decoder found damage.
         refresh_packets: number of packets before this one that are still needed, under periodic intra refresh.
         lacks_timestamp: whether the packet holds a frame without a timestamp.
-        reports_all_damage: whether the decoder reports all damage with the packet, not only with the output frame.
     """
 
     timestamp: int | None
@@ -61,7 +56,6 @@ class DecodedPacket:
     damaged: bool
     refresh_packets: int = 0
     lacks_timestamp: bool = False
-    reports_all_damage: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,7 +108,7 @@ class FrameOrder:
             if packet.damaged:
                 self._mark_damaged(packet.timestamp)
             while packet.frames:
-                yield from self._add_frame(packet.frames.pop(0), packet.reports_all_damage)
+                yield from self._add_frame(packet.frames.pop(0))
             if not self.damaged:
                 self.max_unstamped = max(self.max_unstamped, self.unstamped)
             yield from self._overdue_frames(self.max_unstamped)
@@ -148,7 +142,7 @@ class FrameOrder:
         if number not in self.damaged[-1:]:
             insort(self.damaged, number)
 
-    def _add_frame(self, frame: DecodedFrame, reports_all_damage: bool) -> Iterator[Frame]:
+    def _add_frame(self, frame: DecodedFrame) -> Iterator[Frame]:
         """Yield the frames that can be passed on after the decoder has output this one."""
         if self.shape is None and frame.image is not None:
             self.shape = frame.image.shape
@@ -156,9 +150,7 @@ class FrameOrder:
             self._mark_damaged(frame.timestamp)
         if frame.timestamp not in self.lost:
             self.held.append(frame)
-        while self.held and (
-            reports_all_damage or len(self.held) > MAX_REORDERED_FRAMES or self._is_ready(self.held[0], frame.timestamp)
-        ):
+        while self.held and (len(self.held) > MAX_REORDERED_FRAMES or self._is_ready(self.held[0], frame.timestamp)):
             yield from self._release(self.held.popleft())
 
     def _is_ready(self, frame: DecodedFrame, output_timestamp: int | None) -> bool:
@@ -209,4 +201,4 @@ class FrameOrder:
 
 def _output_frame(time: float, frame: DecodedFrame, intact: bool) -> Frame:
     """Frame at its time, without an image unless it is intact."""
-    return Frame(time, frame.image, frame.quantisation_steps, frame.lag_factor) if intact else Frame(time, None)
+    return Frame(time, frame.image if intact else None)

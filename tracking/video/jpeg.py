@@ -69,7 +69,7 @@ class JpegDecoder:
         results: list[DecodingResult] = []
         for packet in packets:
             image = self.decode_image(packet) if packet.size and not packet.is_corrupt else None
-            frames = [] if image is None else [DecodedFrame(packet.pts, image, None)]
+            frames = [] if image is None else [DecodedFrame(packet.pts, image)]
             results.append((packet, frames, packet.size > 0 and image is None))
         return results
 

@@ -1,4 +1,4 @@
-"""NAL units, of which packets of H.264 and HEVC consist (Rec. ITU-T H.264, 7.3.1 and annex B; H.265 likewise)."""
+"""NAL units, of which packets of H.264 consist (Rec. ITU-T H.264, 7.3.1 and annex B)."""
 
 from dataclasses import dataclass, field
 
@@ -7,7 +7,7 @@ import av
 START_CODE = b"\0\0\1"
 # The decoder configuration record of a file (ISO/IEC 14496-15) begins with this version. The offset is that of the byte
 # that holds the size of the length fields.
-CONFIGURATION_VERSION, LENGTH_SIZE_OFFSET = b"\1", {"h264": 4, "hevc": 21}
+CONFIGURATION_VERSION, LENGTH_SIZE_OFFSET = b"\1", 4
 # First byte of an H.264 unit: nal_ref_idc says whether other frames refer to it, nal_unit_type what it contains.
 REF_IDC_MASK, TYPE_MASK = 0x60, 31
 MAX_SLICE_TYPE, SEI_TYPE = 5, 6  # types 1 to 5 are slices
@@ -25,12 +25,11 @@ class NalUnits:
     length_size: int
 
     @classmethod
-    def of(cls, codec: str, extradata: bytes | None) -> "NalUnits":
-        """Read from a stream's extradata; `codec` is h264 or hevc."""
+    def of(cls, extradata: bytes | None) -> "NalUnits":
+        """Read from a stream's extradata."""
         record = extradata or b""
-        offset = LENGTH_SIZE_OFFSET[codec]
-        has_lengths = record.startswith(CONFIGURATION_VERSION) and len(record) > offset
-        return cls(1 + (record[offset] & 3) if has_lengths else 0)
+        has_lengths = record.startswith(CONFIGURATION_VERSION) and len(record) > LENGTH_SIZE_OFFSET
+        return cls(1 + (record[LENGTH_SIZE_OFFSET] & 3) if has_lengths else 0)
 
     def split(self, content: bytes) -> list[bytes]:
         """Units of a packet; none if their lengths do not add up."""
@@ -44,16 +43,6 @@ class NalUnits:
             units.append(content[start + self.length_size : end])
             start = end
         return units
-
-    def count_slices(self, content: bytes) -> int:
-        """Count the slices in a packet of H.264."""
-        return sum(0 < unit[0] & TYPE_MASK <= MAX_SLICE_TYPE for unit in self.split(content))
-
-    def join(self, units: list[bytes]) -> bytes:
-        """Assemble a packet from units."""
-        return b"".join(
-            (len(unit).to_bytes(self.length_size, "big") if self.length_size else START_CODE) + unit for unit in units
-        )
 
 
 @dataclass

@@ -54,6 +54,7 @@ class Video:
         fps: frames per second that the container announces; 0 if it does not.
         capture_fps: frames per second at which the camera recorded a slow-motion file, which plays more slowly; 0 if
             the file does not say.
+        predicted_frames: whether the encoder predicted frames from others, with loss.
     """
 
     path: Path
@@ -61,6 +62,7 @@ class Video:
     frames: int
     fps: float
     capture_fps: float = 0.0
+    predicted_frames: bool = False
 
     def read(self) -> Reading:
         """Read every frame in order; a separate thread decodes a few frames in advance.
@@ -129,7 +131,9 @@ def open_video(path: Path) -> Video:
                 )
             if first is not None and quarter_turns(first) % 2:
                 size = (size[1], size[0])
-            return Video(path, size, frames, fps, _capture_fps(container.metadata))
+            codec = stream.codec_context.codec
+            predicted = bool(codec.lossy and not codec.intra_only)
+            return Video(path, size, frames, fps, _capture_fps(container.metadata), predicted)
     except (av.FFmpegError, OSError) as error:
         raise InputError(
             f"expected a video in {path}, which cannot be opened ({error}); copy it again from the camera"

@@ -10,7 +10,7 @@ import pytest
 from support import RAMP_FRAMES, ramp_frame, write_video
 
 from rafl.common.errors import InputError
-from rafl.tracking.video.ffmpeg import FFmpegDecoder, read_packets
+from rafl.tracking.video.ffmpeg import read_packets
 from rafl.tracking.video.reader import open_video
 
 CHECKSUM_OPTIONS = {"libx264": {"g": "6"}, "ffv1": {"level": "3", "slicecrc": "1", "g": "6"}}  # short groups, checksums
@@ -161,21 +161,12 @@ def test_frames_shown_before_a_damaged_one_they_refer_to_are_missing(tmp_path: P
     assert wrong == 0
 
 
-@pytest.mark.parametrize(
-    ("codec", "options", "max_wrong"),
-    [
-        ("libx265", {"x265-params": "log-level=none:ctu=16:keyint=10"}, 4),
-        ("libx265", {"x265-params": "log-level=none:ctu=16:keyint=10:wpp=0"}, 4),  # without row offsets
-        ("libsvtav1", {"crf": "20", "preset": "10", "g": "10"}, 2),
-    ],
-)
-def test_damage_that_decoders_do_not_report_is_mostly_found(
-    tmp_path: Path, codec: str, options: dict[str, str], max_wrong: int
-) -> None:
-    """A bit or some bytes of HEVC and AV1 are overwritten. FFmpeg alone decodes a third of the copies wrongly."""
+def test_most_damage_to_av1_is_found(tmp_path: Path) -> None:
+    """A bit or some bytes are overwritten. The decoder reports what its checks find."""
     path = tmp_path / "a.mp4"
     random = np.random.default_rng(6)
-    write_video(path, codec, "yuv420p", options=options, frames=moving_texture(random))
+    options = {"crf": "20", "preset": "10", "g": "10"}
+    write_video(path, "libsvtav1", "yuv420p", options=options, frames=moving_texture(random))
     with av.open(str(path)) as container:
         packets = [bytes(packet) for packet in container.demux(video=0) if packet.size]
     wrong_copies = 0
@@ -185,41 +176,7 @@ def test_damage_that_decoders_do_not_report_is_mostly_found(
         noise = random.bytes(min(12, len(packets[packet]) - start))
         bit = bytes([packets[packet][start] ^ 1 << int(random.integers(8))])
         wrong_copies += count_lost_and_wrong(path, packet, start, bit if number % 2 else noise)[1] > 0
-    assert wrong_copies <= max_wrong
-
-
-def test_intact_hevc_has_no_false_damage(tmp_path: Path) -> None:
-    """Frames take motion from earlier ones; a check of one packet must not depend on memory that is left over."""
-    path = tmp_path / "a.mp4"
-    write_video(path, "libx265", "yuv420p", options={"x265-params": "log-level=none:bframes=0:qp=24"})
-    for _ in range(30):
-        assert all(frame.image is not None for frame in open_video(path).read())
-
-
-def test_h264_reports_damage_with_the_packet(tmp_path: Path) -> None:
-    """Frames shown before a damaged one that they refer to then need not wait for its output.
-
-    A bit is flipped, which often leaves only a part of the image undecoded.
-    """
-    path, damaged = tmp_path / "a.mp4", tmp_path / "damaged.mp4"
-    random = np.random.default_rng(9)
-    write_video(path, "libx264", "yuv420p", options={"crf": "20", "bf": "3"}, frames=moving_texture(random))
-    with av.open(str(path)) as container:
-        packets = [bytes(packet) for packet in container.demux(video=0) if packet.size > 80]
-    corrupt: list[int | None] = []
-    for _ in range(60):
-        content, victim = bytearray(path.read_bytes()), packets[random.integers(len(packets))]
-        content[content.find(victim) + random.integers(40, len(victim))] ^= 1 << random.integers(8)
-        damaged.write_bytes(content)
-        with av.open(str(damaged)) as container:
-            decoder = FFmpegDecoder(container.streams.video[0])
-            reported = set()
-            for packet in container.demux(video=0):
-                frames, damage = decoder.decode_packet(packet)
-                reported |= {packet.pts} if damage else set()
-                corrupt += [frame.pts for frame in frames if frame.is_corrupt]
-                assert all(frame.pts in reported for frame in frames if frame.is_corrupt)
-    assert len(corrupt) > 5
+    assert wrong_copies <= 2
 
 
 def test_stream_that_begins_within_a_file_is_skipped() -> None:

@@ -14,7 +14,6 @@ from support import RAMP_FRAMES, ramp_frame, write_video
 from rafl.common.errors import InputError
 from rafl.tracking.video.decoding import Decoder, _decode_all, read_frames
 from rafl.tracking.video.frame_order import DecodedFrame, DecodedPacket, FrameOrder
-from rafl.tracking.video.quantisation import STEP_EQUIVALENTS
 from rafl.tracking.video.reader import open_video
 
 LOW_LOSS_OPTIONS = {
@@ -155,7 +154,7 @@ def test_frame_output_after_its_slot_was_lost_is_dropped() -> None:
 
 def packet_with_output(timestamp: int, random_access: bool, *output: int) -> DecodedPacket:
     """Packet at a timestamp [10 ms], after which the decoder outputs the frames with the timestamps `output`."""
-    frames = [DecodedFrame(number, ramp_frame(number % 12), None) for number in output]
+    frames = [DecodedFrame(number, ramp_frame(number % 12)) for number in output]
     return DecodedPacket(timestamp, random_access, 0.01, frames, damaged=False)
 
 
@@ -210,68 +209,6 @@ def test_display_rotation_is_applied(tmp_path: Path, name: str, codec: str, pixe
     assert np.corrcoef(image.ravel(), clockwise.ravel())[0, 1] > 0.99
 
 
-def test_h264_quantisation_steps_rotate_with_the_image(tmp_path: Path) -> None:
-    """Macroblocks of H.264 differ in their steps. A fixed quantiser of 30 gives 20 grey levels, Motion JPEG no steps.
-
-    Fast encoder presets give larger steps. The last frames are sampled too.
-    """
-    path = tmp_path / "a.mp4"
-    write_video(path, "libx264", "yuv420p", options={"crf": "25", "aq-mode": "1", "aq-strength": "2"})
-    unrotated = [frame.quantisation_steps for frame in open_video(path).read()]
-    set_quarter_turn(path)
-    rotated = list(open_video(path).read())
-    assert [number for number, steps in enumerate(unrotated) if steps is not None] == [0, 5, 10, 11]
-    for number in (0, 5, 10, 11):
-        steps = unrotated[number]
-        assert steps is not None
-        assert steps.shape == (4, 6)
-        np.testing.assert_array_equal(rotated[number].quantisation_steps, np.rot90(steps, -1))
-    assert len(np.unique(unrotated[0])) > 1
-    corners = np.array([[0.0, 0.0], [63.4, 0.0], [63.4, 95.4], [np.nan, np.nan]])
-    first = np.rot90(unrotated[0], -1)
-    np.testing.assert_array_equal(rotated[0].quantisation_step_at(corners)[:3], [first[0, 0], first[0, 3], first[5, 3]])
-
-    write_video(path, "libx264", "yuv420p", options={"qp": "30", "bf": "0"})
-    later = list(open_video(path).read())[5]
-    np.testing.assert_allclose(later.quantisation_steps, 20.0)
-    for preset, factor in (("ultrafast", 2.4), ("veryfast", 1.0), ("faster", 1.2), ("medium", 1.0), ("slow", 1.0)):
-        write_video(path, "libx264", "yuv420p", options={"qp": "30", "bf": "0", "preset": preset})
-        np.testing.assert_allclose(list(open_video(path).read())[5].quantisation_steps, factor * 20.0)
-    write_video(path.with_suffix(".avi"), "mjpeg", "yuvj420p")
-    frame = next(iter(open_video(path.with_suffix(".avi")).read()))
-    assert frame.quantisation_steps is None
-    assert np.isnan(frame.quantisation_step_at(corners)).all()
-
-
-def test_lag_factor_is_largest_for_b_frames_of_fast_presets(tmp_path: Path) -> None:
-    """Of twelve frames all but 0, 4, 8 and the last are B frames; no other frame refers to the last."""
-    path = tmp_path / "a.mp4"
-    presets = ("veryfast", 1.8, 3.9, 3.9), ("faster", 1.0, 1.4, 2.0), ("medium", 1.0, 1.0, 2.0)
-    for preset, p_frames, b_frames, last in presets:
-        options = {"qp": "30", "bf": "3", "b-adapt": "0", "b-pyramid": "none", "preset": preset}
-        write_video(path, "libx264", "yuv420p", options=options)
-        expected = [b_frames if number % 4 else p_frames for number in range(11)] + [last]
-        assert [frame.lag_factor for frame in open_video(path).read()] == expected
-    path.write_bytes(path.read_bytes().replace(b"x264 - core", b"camera core"))  # no encoder note
-    expected = [1.5 if number % 4 else 1.2 for number in range(11)] + [2.0]
-    assert [frame.lag_factor for frame in open_video(path).read()] == expected
-
-
-@pytest.mark.parametrize(("ending", "bits"), [("mp4", ""), ("ts", ""), ("mkv", "10le")])
-def test_hevc_quantisation_steps(tmp_path: Path, ending: str, bits: str) -> None:
-    """Quantisers of 24 and 30 give 10 and 20 grey levels with 8 and 10 bits. The first frame's quantiser is 3 lower."""
-    path = tmp_path / f"a.{ending}"
-    factor, power = STEP_EQUIVALENTS["hevc"]
-    for quantiser, step in ((24, 10.0), (30, 20.0)):
-        options = {"x265-params": f"log-level=none:bframes=0:qp={quantiser}"}
-        write_video(path, "libx265", "yuv420p" + bits, options=options)
-        found = [frame.quantisation_steps for frame in open_video(path).read()]
-        steps = np.array([np.full((1, 1), np.nan) if each is None else each for each in found])
-        assert steps.shape == (12, 1, 1)
-        own = (steps.ravel() / factor) ** (1.0 / power)
-        np.testing.assert_allclose(own, [step / np.sqrt(2.0), *[step] * 11], rtol=1e-6)
-
-
 def test_title_that_is_not_utf8_is_accepted(tmp_path: Path) -> None:
     """Older cameras and programs write titles in Latin-1."""
     path = tmp_path / "a.mp4"
@@ -281,23 +218,14 @@ def test_title_that_is_not_utf8_is_accepted(tmp_path: Path) -> None:
     assert sum(frame.image is not None for frame in open_video(path).read()) == 12
 
 
-@pytest.mark.parametrize(
-    ("codec", "fine", "coarse"),
-    [
-        ("mpeg4", {"qmin": "3", "qmax": "3"}, {"qmin": "9", "qmax": "9"}),
-        ("libvpx-vp9", {"crf": "15", "b": "0"}, {"crf": "45", "b": "0"}),
-        ("libsvtav1", {"crf": "15", "preset": "10"}, {"crf": "45", "preset": "10"}),
-    ],
-)
-def test_quantisation_steps_of_other_codecs(
-    tmp_path: Path, codec: str, fine: dict[str, str], coarse: dict[str, str]
-) -> None:
-    path, means = tmp_path / "a.mkv", []
-    for options in (fine, coarse):
-        write_video(path, codec, "yuv420p", options=options)
-        steps = [frame.quantisation_steps for frame in open_video(path).read()]
-        means.append(np.mean([each.mean() for each in steps if each is not None]))
-    assert means[1] > 1.5 * means[0] > 1.0
+def test_predicted_frames_are_those_of_lossy_codecs_with_references(tmp_path: Path) -> None:
+    for name, codec, pixels, predicted in (
+        ("a.mp4", "libx264", "yuv420p", True),
+        ("a.mov", "mjpeg", "yuvj420p", False),
+        ("a.mkv", "ffv1", "gray", False),
+    ):
+        write_video(tmp_path / name, codec, pixels)
+        assert open_video(tmp_path / name).predicted_frames == predicted
 
 
 def test_sixteen_bit_images(tmp_path: Path) -> None:
