@@ -39,6 +39,7 @@ class SyntheticVideo:
     seed: int
     occluded: np.ndarray | None = None
     path: Path = Path("drawn")
+    predicted_frames: bool = False
 
     def read(self) -> Reading:
         return Reading(self.frames())

@@ -25,7 +25,7 @@ MIN_CONTRAST = 12.0  # grey levels
 MODEL_ERROR = 1e-3  # px: error of the centre that the disc model itself causes
 CORRELATED_VARIANCE_RATIO = 1.25  # block variance over that of independent errors, above which errors are correlated
 MIN_DOTS_FOR_TWO_THREADS = 64  # with fewer dots, decoding takes longer than fitting
-STATISTIC_COUNT = 10  # statistics of one fit, see `_describe`
+STATISTIC_COUNT = 8  # statistics of one fit, see `_describe`
 MIN_DOWNSAMPLED_RADIUS = 1.9  # px: radius of the smallest dots that the fast search finds in a downsampled frame
 MIN_SEPARATION_RADII = 0.6  # radii: two detections closer than this are the same dot
 RELATIVE_CONTRAST_TOLERANCE = 0.2  # logarithm: dots of less different relative contrast may be alike in any light
@@ -47,8 +47,6 @@ class Dots:
         relative_radius_sigma: of the radius over the radius; large for small defocused dots, (D).
         axis_ratio: minor over major semi-axis, 1 for a circle, (D).
         contrast: level of the dot minus that of its surroundings, negative for dark dots [grey levels], (D).
-        noise_gain: centre's sigma for independent noise of one grey level in every pixel,
-            sqrt(sum over pixels k of (d centre / d level_k)^2) [px per grey level], (D, 2).
         residual: root mean square residual over |contrast|, (D).
         misfit: the same without the pixel noise, which is estimated only where the residual is large, (D).
         mean_weight: of the pixels in the fit, 0 to 1, (D).
@@ -61,7 +59,6 @@ class Dots:
     relative_radius_sigma: Array
     axis_ratio: Array
     contrast: Array
-    noise_gain: Array
     residual: Array
     misfit: Array
     mean_weight: Array
@@ -76,6 +73,13 @@ class Dots:
     def relative_contrast(self) -> Array:
         """|contrast| over the brighter level of dot and surroundings: independent of the illumination, (D)."""
         return np.asarray(relative_contrast(self.contrast, self.parameters[:, 9]))
+
+    @property
+    def half_width(self) -> Array:
+        """Half the width of the outline along x and y [px], (D, 2)."""
+        a, b, c = self.parameters[:, 2:5].T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.asarray(np.stack([np.hypot(b, c), np.hypot(a, b)], axis=1) / np.abs(a * c - b * b)[:, None])
 
     @property
     def blur(self) -> Array:
@@ -98,7 +102,7 @@ class Dots:
         nan = np.full(count, np.nan)
         pair = np.full((count, 2), np.nan)
         parameters = np.full((count, PARAMETER_COUNT), np.nan)
-        return cls(pair, pair.copy(), parameters, nan, nan, nan, nan, pair.copy(), nan, nan, nan)
+        return cls(pair, pair.copy(), parameters, nan, nan, nan, nan, nan, nan, nan)
 
 
 @njit(cache=True)
@@ -135,13 +139,12 @@ def _fit_range(
 def _describe(p: Array, quality: Array, statistics: Array) -> None:
     """Fill the statistics of one fit, defined in `Dots`, from its parameters and its quality.
 
-    In order: sigma (2), noise gain (2), radius, axis ratio, residual, mean weight, relative radius sigma, misfit.
+    In order: sigma (2), radius, axis ratio, residual, mean weight, relative radius sigma, misfit.
     """
     statistics[0:2] = np.nan
-    statistics[2], statistics[3] = np.sqrt(quality[1]), np.sqrt(quality[2])
-    statistics[4], statistics[5], statistics[8] = np.nan, 0.0, np.nan
-    statistics[6], statistics[7] = np.sqrt(quality[5]) / max(abs(p[8]), 1e-12), quality[6]
-    statistics[9] = np.sqrt(quality[5] - quality[10]) / max(abs(p[8]), 1e-12)
+    statistics[2], statistics[3], statistics[6] = np.nan, 0.0, np.nan
+    statistics[4], statistics[5] = np.sqrt(quality[5]) / max(abs(p[8]), 1e-12), quality[6]
+    statistics[7] = np.sqrt(quality[5] - quality[10]) / max(abs(p[8]), 1e-12)
     determinant = p[2] * p[4] - p[3] * p[3]
     mean = 0.5 * (p[2] + p[4])
     if not (quality[0] > 0.0 and determinant > 0.0 and mean > 0.0):
@@ -151,9 +154,9 @@ def _describe(p: Array, quality: Array, statistics: Array) -> None:
     statistics[0] = np.sqrt((quality[3] if correlated else independent_x) + quality[7] ** 2 + MODEL_ERROR**2)
     statistics[1] = np.sqrt((quality[4] if correlated else independent_y) + quality[8] ** 2 + MODEL_ERROR**2)
     spread = np.sqrt(max(mean * mean - determinant, 0.0))
-    statistics[4] = 1.0 / np.sqrt(determinant)
-    statistics[8] = np.sqrt(quality[9] * quality[5]) / mean
-    statistics[5] = (mean - spread) / (mean + spread)
+    statistics[2] = 1.0 / np.sqrt(determinant)
+    statistics[6] = np.sqrt(quality[9] * quality[5]) / mean
+    statistics[3] = (mean - spread) / (mean + spread)
 
 
 def fit_dots(image: Array, starts: Array, fit_count: int | None = None, robust: bool = True) -> Dots:
@@ -179,14 +182,13 @@ def fit_dots(image: Array, starts: Array, fit_count: int | None = None, robust: 
         centre=fitted[:, :2],
         sigma=statistics[:, :2],
         parameters=fitted,
-        radius=statistics[:, 4],
-        relative_radius_sigma=statistics[:, 8],
-        axis_ratio=statistics[:, 5],
+        radius=statistics[:, 2],
+        relative_radius_sigma=statistics[:, 6],
+        axis_ratio=statistics[:, 3],
         contrast=fitted[:, 8],
-        noise_gain=statistics[:, 2:4],
-        residual=statistics[:, 6],
-        misfit=statistics[:, 9],
-        mean_weight=statistics[:, 7],
+        residual=statistics[:, 4],
+        misfit=statistics[:, 7],
+        mean_weight=statistics[:, 5],
     )
 
 

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from rafl.common.errors import InputError
 from rafl.tracking.detection.appearance import find_markers
 from rafl.tracking.detection.detect import Dots, to_eight_bits
-from rafl.tracking.detection.truncated import with_truncation_error
 from rafl.tracking.linking.late_markers import LateMarker
 from rafl.tracking.linking.repeated_frames import find_repeated_frames
 from rafl.tracking.linking.shape_prior import ShapePrior
@@ -81,7 +80,7 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
             max_dots = max(max_dots, 0 if found is None else len(found[1]))
             if found is not None and len(found[1]) >= MIN_MARKERS:
                 tracker = Tracker(*found)
-                detected = Detections.of(with_truncation_error(frame.image.shape, found[1]))
+                detected = Detections.of(found[1])
         elif frame.image is not None and tracker is not None:
             detected = Detections.of(tracker.advance(frame.image))
             late += tracker.add_late_markers(len(times) - 1, frame.image)
@@ -100,8 +99,8 @@ def follow(video: Video, tick: Callable[[], None]) -> PixelTracks:
         )
     with ThreadPoolExecutor(1) as background:
         images = background.submit(worst_frames.encode)
-        pixel, fit_sigma = _assemble(detections, late, len(tracker.pattern.rest))
-        sigma = with_error_floor(pixel, fit_sigma, video.predicted_frames)
+        pixel, fit_sigma, half_width = _assemble(detections, late, len(tracker.pattern.rest))
+        sigma = with_error_floor(pixel, fit_sigma, half_width, video.predicted_frames)
     start = tracker.pattern.rest
     if late:
         is_late = np.arange(len(start)) >= len(start) - len(late)
@@ -128,30 +127,36 @@ class Detections:
     Attributes:
         pixel: positions [px], (D, 2), NaN where not visible.
         sigma: from the fits [px], (D, 2), NaN where not visible.
+        half_width: of their outlines along x and y [px], (D, 2).
     """
 
     pixel: Array
     sigma: Array
+    half_width: Array
 
     @classmethod
     def of(cls, dots: Dots) -> "Detections":
         """From the dots of a frame; those without a sigma are not visible."""
-        return cls(np.where(np.isfinite(dots.sigma), dots.centre, np.nan), dots.sigma)
+        return cls(np.where(np.isfinite(dots.sigma), dots.centre, np.nan), dots.sigma, dots.half_width)
 
 
-NO_MARKERS = Detections(np.empty((0, 2)), np.empty((0, 2)))
+NO_MARKERS = Detections(*np.empty((3, 0, 2)))
 
 
-def _assemble(detections: list[Detections], late: list[LateMarker], count: int) -> tuple[Array, Array]:
-    """Positions and sigmas of all `count` markers [px], (T, D, 2), NaN where not measured; late-detected ones last."""
-    pixel, sigma = np.full((2, len(detections), count, 2), np.nan)
+def _assemble(detections: list[Detections], late: list[LateMarker], count: int) -> tuple[Array, Array, Array]:
+    """Positions, sigmas and half widths of all `count` markers [px], (T, D, 2) each; late-detected ones last.
+
+    They are NaN where not measured.
+    """
+    pixel, sigma, half_width = np.full((3, len(detections), count, 2), np.nan)
     for frame, detected in enumerate(detections):
         known = len(detected.pixel)
         pixel[frame, :known], sigma[frame, :known] = detected.pixel, detected.sigma
+        half_width[frame, :known] = np.where(np.isfinite(detected.sigma), detected.half_width, np.nan)
     for column, marker in enumerate(late, start=count - len(late)):
         for frame, (position, position_sigma) in marker.seen.items():
             pixel[frame, column], sigma[frame, column] = position, position_sigma
-    return pixel, sigma
+    return pixel, sigma, half_width
 
 
 def _predict_late_starts(start: Array, pixel: Array, late: NDArray[np.bool_], static: NDArray[np.bool_]) -> Array:

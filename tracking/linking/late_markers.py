@@ -31,7 +31,6 @@ from rafl.tracking.detection.detect import (
     remove_duplicates,
 )
 from rafl.tracking.detection.disc_model import PARAMETER_COUNT
-from rafl.tracking.detection.truncated import with_truncation_error
 from rafl.tracking.linking.late_marker_candidate import Candidate, Observation
 from rafl.tracking.linking.matching import NEIGHBOUR_COUNT, MarkerPattern
 from rafl.tracking.linking.shape_prior import PredictedPosition, ShapePrior
@@ -254,12 +253,12 @@ class LateMarkerFinder:
             near = np.argsort(np.linalg.norm(frame.positions - expected, axis=1))[:NEIGHBOUR_COUNT]
             neighbours = _moved_discs(parameters[near], frame.positions[near])
             starts = np.concatenate([_median_discs(expected[None], parameters), neighbours])
-            dots = with_truncation_error(frame.image.shape, fit_dots(frame.image, starts, 1))
+            dots = fit_dots(frame.image, starts, 1)
             miss = float(np.linalg.norm(dots.centre[0] - expected))
             gate = BACKTRACK_GATE * spacing
             if not since_first:
                 gate = min(gate, EARLIER_GATE_FACTOR * largest_miss + EARLIER_GATE_PX)
-            if self._match(dots)[0] and miss < gate:
+            if self._match(dots)[0] and dots.within(frame.image)[0] and miss < gate:
                 largest_miss, lost, offset = max(largest_miss, miss), 0, offset + dots.centre[0] - expected
                 disc = disc if seen else dots.parameters[0]
                 seen[frame.number] = dots.centre[0], dots.sigma[0]

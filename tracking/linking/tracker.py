@@ -23,8 +23,6 @@ from rafl.tracking.detection.detect import (
     relative_contrast,
     remove_duplicates,
 )
-from rafl.tracking.detection.partial_occlusion import PartialOcclusion
-from rafl.tracking.detection.truncated import with_truncation_error
 from rafl.tracking.linking.late_markers import LateMarker, LateMarkerFinder
 from rafl.tracking.linking.matching import MarkerPattern, match_markers
 from rafl.tracking.linking.motion_prediction import MotionPredictor
@@ -73,7 +71,6 @@ class Tracker:
         self.frame_count = 0  # tracked so far
         self.first_frame = np.zeros(len(first), dtype=np.int64)  # `frame_count` when each marker was added
         self.starts_from_median = np.zeros(len(first), bool)  # markers whose own last disc is a bad start of fits
-        self.partial_occlusion = PartialOcclusion(first)
 
     def advance(self, image: Array) -> Dots:
         """The markers' dots (M) in the next frame; sigma is NaN where a marker is not visible."""
@@ -98,9 +95,9 @@ class Tracker:
             dots = _restrict(dots, self._identify(dots, unambiguous, guess))
             dots = self._fit_at_shifted(image, dots, expected, guess)
             dots = _restrict(dots, self._identify(dots, unambiguous, guess))
-        dots = with_truncation_error(image.shape, dots)
+        dots = _restrict(dots, dots.within(image))
         self._update(dots, unambiguous, guess)
-        return self.partial_occlusion.adjust_sigma(dots, self.pattern.rest)
+        return dots
 
     def skip_frame(self) -> None:
         """Advance by a frame that could not be decoded."""
@@ -119,7 +116,6 @@ class Tracker:
             self.static_dots.add_marker()
             self.starts_from_median = np.append(self.starts_from_median, False)
             self.first_frame = np.append(self.first_frame, self.frame_count)
-            self.partial_occlusion.add_marker()
             self.pattern = MarkerPattern.of(np.concatenate([self.pattern.rest, marker.rest[None]]))
             self.parameters = np.concatenate([self.parameters, marker.parameters[None]])
             self.frames_missing = np.append(self.frames_missing, 0 if number in marker.seen else 1)

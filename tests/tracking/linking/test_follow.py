@@ -22,6 +22,7 @@ class Drawn:
 
     positions: np.ndarray
     path: Path = Path("drawn.mp4")
+    predicted_frames: bool = False
     hidden: tuple[int, ...] = ()  # frames that do not show the first three dots
     blobs: tuple[tuple[float, float], ...] = ()  # static, shown from frame 5 on
     radius: float = 6.0

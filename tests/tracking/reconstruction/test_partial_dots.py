@@ -1,12 +1,12 @@
+"""Sigma of dots that the image border truncates or that something occludes in part, from the recording itself."""
+
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support import draw_outlines, irregular_outline
+from support import draw_frame, draw_outlines, irregular_outline
 
-from rafl.tracking.detection.detect import fit_dots, initial_parameters
-from rafl.tracking.detection.truncated import with_truncation_error
 from rafl.tracking.linking.follow import follow
 from rafl.tracking.video.frame import Frame
 from rafl.tracking.video.reader import Reading
@@ -21,6 +21,7 @@ class FakeVideo:
 
     images: list[np.ndarray]
     path: Path = Path("fake.mp4")
+    predicted_frames: bool = False
 
     def read(self) -> Reading:
         return Reading(Frame(0.01 * frame, image) for frame, image in enumerate(self.images))
@@ -56,31 +57,36 @@ def track_crossing(random: np.random.Generator, waves: float) -> tuple[np.ndarra
     return distance, error, tracks.sigma[:, row], np.isfinite(error[..., 0])
 
 
+@pytest.mark.parametrize("level", [20, 110, 230])
+@pytest.mark.parametrize("across", [False, True])
+def test_sigma_covers_the_error_of_dots_behind_a_bar(level: int, across: bool) -> None:
+    """A bar passes over a swinging body."""
+    rest = np.stack(np.meshgrid(40.0 + 34.0 * np.arange(8), 80.0 + 34.0 * np.arange(3)), axis=-1).reshape(-1, 2)
+    swing = 12.0 * np.sin(2 * np.pi * np.arange(60) / 9.3)[:, None] * ((rest[:, 0] - 20) / 260) ** 2
+    truth = np.stack([np.broadcast_to(rest[:, 0], swing.shape), rest[:, 1] + swing], axis=-1)
+    images = []
+    for frame, positions in enumerate(truth):
+        image = draw_frame([(x, y, 6.0, 6.0, 0.0) for x, y in positions], (360, 240), noise=2.0, seed=frame)
+        bar = slice(max(6 * frame - 60, 0), max(6 * frame - 20, 0))
+        image[(bar, slice(None)) if across else (slice(None), bar)] = level
+        images.append(image)
+    tracks = follow(FakeVideo(images), lambda: None)
+    order = np.linalg.norm(truth[0][:, None] - tracks.start, axis=2).argmin(axis=1)
+    error, sigma = np.abs(tracks.pixel[:, order] - truth), tracks.sigma[:, order]
+    measured = np.isfinite(sigma)
+    assert measured.mean() > 0.75
+    # A bar along a row shifts all its dots alike, which looks like a motion.
+    assert (error > np.maximum(0.25, 4.0 * sigma))[measured].mean() < 0.005
+    assert np.nanmedian(sigma) < 0.03
+
+
 @pytest.mark.parametrize("waves", [0.0, 0.03, 0.08])
 def test_sigma_covers_the_error_of_truncated_dots(random: np.random.Generator, waves: float) -> None:
-    """Some irregular dots are off by 1.6 or 2 px: these count as missing, but for one in fifty."""
+    """Some irregular dots are off by 1.6 or 2 px, which their sigma contains, but for one in thirty."""
     recordings = [track_crossing(random, waves) for _ in range(3)]
     distance, error, sigma, measured = (np.concatenate(values) for values in zip(*recordings, strict=True))
     truncated = measured & (distance < 1.0)
     assert truncated.sum() > 0.5 * ((distance > 0.1) & (distance < 1.0)).sum()
     wrong = np.abs(error).max(axis=-1) > np.maximum(4.0 * sigma.max(axis=-1), 0.25)
     assert (truncated & wrong).sum() <= (0.03 * truncated.sum() if waves else 0)
-    assert np.sqrt((error[truncated] ** 2).mean()) < (0.25 if waves else 0.05)
-
-
-def test_only_irregular_truncated_dots_get_a_larger_sigma(random: np.random.Generator) -> None:
-    """A hand-drawn dot at the border does; a disc, or a dot farther in, does not."""
-    for waves, change in ((0.0, 1.0), (0.06, 2.0)):
-        ratios = []
-        for _ in range(8):
-            outline = irregular_outline(random, RADIUS, waves)
-            image = draw_outlines(
-                [outline + np.array(centre) for centre in ((4.0, 30.0), (40.0, 30.0))], (70, 60), random
-            )
-            shape = np.array([1.0, 0.0, 1.0]) / RADIUS
-            starts = [initial_parameters(x, 30.0, shape, -120.0, 170.0) for x in (4.0, 40.0)]
-            dots = fit_dots(image, np.array(starts))
-            ratios.append(with_truncation_error(image.shape, dots).sigma / dots.sigma)
-        ratio = np.array(ratios)
-        np.testing.assert_array_equal(ratio[:, 1], 1.0)
-        assert np.mean(~(ratio[:, 0] < change)) > 0.8 if waves else np.mean(ratio[:, 0] == change) > 0.7
+    assert np.sqrt((error[truncated] ** 2).mean()) < (0.5 if waves else 0.05)
