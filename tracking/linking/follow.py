@@ -175,7 +175,7 @@ def _predict_late_starts(start: Array, pixel: Array, late: NDArray[np.bool_], st
         prior.add_shape(positions, np.ones(len(start), bool))
     if len(prior) < MIN_SHAPES or not known.any():
         return start
-    return np.where((late & ~static)[:, None], prior.predict(start, known).position, start)
+    return np.where((late & ~static)[:, None], prior.predict(start, np.where(known, 0.0, np.inf)).position, start)
 
 
 class _WorstFrames:

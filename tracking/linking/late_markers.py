@@ -33,7 +33,7 @@ from rafl.tracking.detection.detect import (
 from rafl.tracking.detection.disc_model import PARAMETER_COUNT
 from rafl.tracking.linking.late_marker_candidate import Candidate, Observation
 from rafl.tracking.linking.matching import NEIGHBOUR_COUNT, MarkerPattern
-from rafl.tracking.linking.shape_prior import PredictedPosition, ShapePrior
+from rafl.tracking.linking.shape_prior import ShapePrior
 
 Array = NDArray[Any]
 
@@ -135,7 +135,7 @@ class LateMarkerFinder:
         if not len(found) and not self._candidates:
             self._next_search = number + IDLE_INTERVAL
             return []
-        rest_of_dots = self._predict_rest(pattern, frame, found).position
+        rest_of_dots = self._predict_rest(pattern, frame, found)[0]
         distance = np.linalg.norm(rest_of_dots[:, None] - pattern.rest[frame.body], axis=2).min(axis=1)
         near = distance < MAX_DISTANCE_ROW_SPACINGS * rows
         self._update_candidates(frame, rest_of_dots[near], found[near], MAX_CANDIDATE_GAP * spacing)
@@ -179,16 +179,16 @@ class LateMarkerFinder:
         ratio: NDArray[np.bool_] = np.abs(np.log(dots.radius / self.appearance.radius)) < np.log(MAX_RADIUS_RATIO)
         return good & ratio
 
-    def _predict_rest(self, pattern: MarkerPattern, frame: _KeptFrame, points: Array) -> PredictedPosition:
-        """Positions in the pattern of points (P, 2) of a frame [px]."""
+    def _predict_rest(self, pattern: MarkerPattern, frame: _KeptFrame, points: Array) -> tuple[Array, Array]:
+        """Positions and their sigma in the pattern of points (P, 2) of a frame [px]."""
         if not len(points):
-            return PredictedPosition(points, np.empty(0))
+            return points, np.empty(0)
         body, count = np.flatnonzero(frame.body), len(points)
         rest = np.concatenate([pattern.rest[body], points])
         sigma = np.append(self.rest_sigma[body], np.full(count, np.inf))
         prior = ShapePrior(np.concatenate([frame.positions[body], points]))
-        predicted = prior.predict(rest, sigma == 0.0, PredictedPosition(rest, sigma))
-        return PredictedPosition(predicted.position[-count:], predicted.sigma[-count:])
+        predicted = prior.predict(rest, sigma)
+        return predicted.position[-count:], predicted.sigma[-count:]
 
     def _update_candidates(self, frame: _KeptFrame, rest: Array, found: Array, max_gap: float) -> None:
         """Assign dots to candidates. Candidates without a dot are dropped, and dots without one become candidates.
@@ -322,7 +322,7 @@ def _is_match(gaps: Array, row: int, column: int, max_gap: float) -> bool:
 def _predict_last(prior: ShapePrior, frame: _KeptFrame, count: int) -> Array:
     """Position of the prior's last marker [px], (2), predicted from the first `count` markers of a frame."""
     positions = np.append(frame.positions[:count], [[0.0, 0.0]], axis=0)
-    last: Array = prior.predict(positions, np.append(frame.body[:count], False)).position[-1]
+    last: Array = prior.predict(positions, np.where(np.append(frame.body[:count], False), 0.0, np.inf)).position[-1]
     return last
 
 

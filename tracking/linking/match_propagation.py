@@ -1,30 +1,25 @@
 """Compiled kernels that spread a match of dots to markers from neighbour to neighbour.
 
-Each step predicts a marker from the affine map of the matches around it, regularised towards the expected map. Shared
+Each step predicts a marker from the affine map of the matches around it, regularised towards the identity. Shared
 arguments:
 
-- shape (M, 2): the markers as last seen [px].
-- expected (M, 2): their expected positions [px].
-- linear (M, 2, 2): the linear part of the expected motion about each marker.
+- shape (M, 2): the pattern [px].
 - spacing (M) [px] and neighbours (M, K), -1 filled: see `MarkerPattern`.
 - dots (D, 2): of the frame [px].
-- buckets (R, C, B): dots by square of side `cell` from `origin` [px], -1 filled.
-- distance_cost: score lost by a dot one spacing from its expected position.
-- steady_bonus (M): score gained by a marker exactly at its expected position.
+- distance_cost: score lost by a dot one spacing from its position in the pattern.
 - taken (D): whether a dot is matched; match (M): the dot of each marker, -1 for none.
 """
 
 import numpy as np
 from numba import njit
 
-STIFFNESS = 0.04  # weight of the expected map, relative to the mean square distance of the matched neighbours
+STIFFNESS = 0.04  # weight of the identity, relative to the mean square distance of the matched neighbours
 GATE_SPACINGS = 0.36  # most distance of a dot from its predicted position
 MISFIT_COST = 0.5  # score lost by a dot at the gate's edge; a matched marker scores 1
-AMBIGUITY_MARGIN = 0.75  # a match whose score is less than this below the best one's may be right as well
 
 
 @njit(cache=True, nogil=True)
-def _predict(marker, shape, linear, spacing, neighbours, dots, match):
+def _predict(marker, shape, spacing, neighbours, dots, match):
     """A marker's position (x, y) from the regularised affine map of its matched neighbours."""
     sw = sx = sy = tx = ty = 0.0  # sums over neighbours, relative to the marker's own position
     mxx = mxy = myy = nxx = nxy = nyx = nyy = 0.0
@@ -61,10 +56,8 @@ def _predict(marker, shape, linear, spacing, neighbours, dots, match):
         mxx, mxy, myy = mxx / sw - sx * sx, mxy / sw - sx * sy, myy / sw - sy * sy
         nxx, nxy, nyx, nyy = nxx / sw - tx * sx, nxy / sw - tx * sy, nyx / sw - ty * sx, nyy / sw - ty * sy
     ridge = STIFFNESS * (mxx + myy) + 1e-3 * spacing[marker] ** 2
-    nxx += ridge * linear[marker, 0, 0]
-    nxy += ridge * linear[marker, 0, 1]
-    nyx += ridge * linear[marker, 1, 0]
-    nyy += ridge * linear[marker, 1, 1]
+    nxx += ridge
+    nyy += ridge
     mxx += ridge
     myy += ridge
     inverse = 1.0 / (mxx * myy - mxy * mxy)
@@ -74,26 +67,20 @@ def _predict(marker, shape, linear, spacing, neighbours, dots, match):
 
 
 @njit(cache=True, nogil=True)
-def _nearest_free(x, y, gate, dots, taken, buckets, cell, origin):
+def _nearest_free(x, y, gate, dots, taken):
     """The nearest dot within `gate` [px] of (x, y) that is not taken, -1 for none."""
     found = -1
     nearest = gate
-    column, row = int((x - origin[0]) / cell), int((y - origin[1]) / cell)
-    for r in range(max(row - 1, 0), min(row + 2, buckets.shape[0])):
-        for c in range(max(column - 1, 0), min(column + 2, buckets.shape[1])):
-            for k in range(buckets.shape[2]):
-                dot = buckets[r, c, k]
-                if dot < 0:
-                    break
-                gap = np.hypot(dots[dot, 0] - x, dots[dot, 1] - y)
-                if gap < nearest and not taken[dot]:
-                    nearest = gap
-                    found = dot
+    for dot in range(dots.shape[0]):
+        gap = np.hypot(dots[dot, 0] - x, dots[dot, 1] - y)
+        if gap < nearest and not taken[dot]:
+            nearest = gap
+            found = dot
     return found
 
 
 @njit(cache=True, nogil=True)
-def _refine(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match):
+def _refine(shape, spacing, neighbours, dots, taken, match):
     """Drop matches that contradict their neighbours, and search again for unmatched markers. Changes match in place."""
     for _ in range(2):
         for marker in range(shape.shape[0]):
@@ -106,52 +93,30 @@ def _refine(shape, linear, spacing, neighbours, dots, buckets, cell, origin, tak
             if around < 3:
                 continue
             match[marker] = -1
-            x, y = _predict(marker, shape, linear, spacing, neighbours, dots, match)
+            x, y = _predict(marker, shape, spacing, neighbours, dots, match)
             if own >= 0:
                 if np.hypot(dots[own, 0] - x, dots[own, 1] - y) < 1.3 * GATE_SPACINGS * spacing[marker]:
                     match[marker] = own
                 else:
                     taken[own] = False
             else:
-                found = _nearest_free(x, y, GATE_SPACINGS * spacing[marker], dots, taken, buckets, cell, origin)
+                found = _nearest_free(x, y, GATE_SPACINGS * spacing[marker], dots, taken)
                 if found >= 0:
                     match[marker] = found
                     taken[found] = True
 
 
 @njit(cache=True, nogil=True)
-def _propagate(
-    shape,
-    expected,
-    linear,
-    spacing,
-    neighbours,
-    dots,
-    buckets,
-    cell,
-    origin,
-    distance_cost,
-    steady_bonus,
-    confirmed,
-    seed,
-    match,
-):
-    """Fill match (M) by spreading from a seed (marker, dot) and the confirmed dots (M), -1 for none. Returns its score.
+def _propagate(shape, spacing, neighbours, dots, distance_cost, seed, match):
+    """Fill match (M) by spreading from a seed (marker, dot). Returns its score.
 
-    The unmatched marker with most matched neighbours comes next. Each matched marker scores 1, plus its steady bonus,
-    less its costs.
+    The unmatched marker with most matched neighbours comes next. Each matched marker scores 1 less its costs.
     """
     count = shape.shape[0]
-    visited = confirmed >= 0
+    visited = np.zeros(count, np.bool_)
     taken = np.zeros(dots.shape[0], np.bool_)
     matched_neighbours = np.zeros(count, np.int64)
-    match[:] = confirmed
-    for marker in range(count):
-        if confirmed[marker] >= 0:
-            taken[confirmed[marker]] = True
-            for k in range(neighbours.shape[1]):
-                if neighbours[marker, k] >= 0:
-                    matched_neighbours[neighbours[marker, k]] += 1
+    match[:] = -1
     marker, found = seed[0], seed[1]
     while True:
         visited[marker] = True
@@ -168,9 +133,9 @@ def _propagate(
         if best < 0:
             break
         marker = best
-        x, y = _predict(marker, shape, linear, spacing, neighbours, dots, match)
-        found = _nearest_free(x, y, GATE_SPACINGS * spacing[marker], dots, taken, buckets, cell, origin)
-    _refine(shape, linear, spacing, neighbours, dots, buckets, cell, origin, taken, match)
+        x, y = _predict(marker, shape, spacing, neighbours, dots, match)
+        found = _nearest_free(x, y, GATE_SPACINGS * spacing[marker], dots, taken)
+    _refine(shape, spacing, neighbours, dots, taken, match)
     score = 0.0
     total = (match >= 0).sum()
     for marker in range(count):
@@ -180,128 +145,31 @@ def _propagate(
         score += 1.0
         if total > 1:
             match[marker] = -1
-            x, y = _predict(marker, shape, linear, spacing, neighbours, dots, match)
+            x, y = _predict(marker, shape, spacing, neighbours, dots, match)
             match[marker] = found
             misfit = np.hypot(dots[found, 0] - x, dots[found, 1] - y) / (GATE_SPACINGS * spacing[marker])
             score -= MISFIT_COST * min(misfit * misfit, 1.5)
-        distance = np.hypot(dots[found, 0] - expected[marker, 0], dots[found, 1] - expected[marker, 1])
+        distance = np.hypot(dots[found, 0] - shape[marker, 0], dots[found, 1] - shape[marker, 1])
         score -= distance_cost * min(distance / spacing[marker], 3.0)
-        score += steady_bonus[marker] * max(1.0 - distance / spacing[marker], 0.0)
     return score
 
 
 @njit(cache=True, nogil=True)
-def best_match(
-    shape,
-    expected,
-    linear,
-    spacing,
-    neighbours,
-    dots,
-    buckets,
-    cell,
-    origin,
-    distance_cost,
-    steady_bonus,
-    seeds,
-    sufficient_score,
-    best,
-):
+def best_match(shape, spacing, neighbours, dots, distance_cost, seeds, sufficient_score, best):
     """Fill best (M) with the best match from seeds (S, 2) of marker and dot, in order. Returns its score.
 
     Stops at the first score of at least `sufficient_score`.
     """
-    match, none_confirmed = np.empty(shape.shape[0], np.int64), np.full(shape.shape[0], -1)
+    match = np.empty(shape.shape[0], np.int64)
     highest = -np.inf
     for s in range(seeds.shape[0]):
         # A seed that the best match already contains would give the same match.
         if highest > -np.inf and best[seeds[s, 0]] == seeds[s, 1]:
             continue
-        score = _propagate(
-            shape,
-            expected,
-            linear,
-            spacing,
-            neighbours,
-            dots,
-            buckets,
-            cell,
-            origin,
-            distance_cost,
-            steady_bonus,
-            none_confirmed,
-            seeds[s],
-            match,
-        )
+        score = _propagate(shape, spacing, neighbours, dots, distance_cost, seeds[s], match)
         if score > highest:
             highest = score
             best[:] = match
         if highest >= sufficient_score:
             break
     return highest
-
-
-@njit(cache=True, nogil=True)
-def agreed_markers(
-    shape,
-    expected,
-    linear,
-    spacing,
-    neighbours,
-    dots,
-    buckets,
-    cell,
-    origin,
-    distance_cost,
-    steady_bonus,
-    confirmed,
-    seeds,
-    best,
-):
-    """Which markers have the same dot in best (M) and in every match with a similar score from another seed, (M).
-
-    All matches keep the confirmed dots (M), -1 for none.
-    """
-    agreed = best >= 0
-    match = np.empty(shape.shape[0], np.int64)
-    first = np.flatnonzero(best >= 0)[0]
-    pair = np.array([first, best[first]])
-    score = _propagate(
-        shape,
-        expected,
-        linear,
-        spacing,
-        neighbours,
-        dots,
-        buckets,
-        cell,
-        origin,
-        distance_cost,
-        steady_bonus,
-        best,
-        pair,
-        match,
-    )
-    for s in range(seeds.shape[0]):
-        marker, dot = seeds[s, 0], seeds[s, 1]
-        if best[marker] == dot or confirmed[marker] >= 0:
-            continue
-        other = _propagate(
-            shape,
-            expected,
-            linear,
-            spacing,
-            neighbours,
-            dots,
-            buckets,
-            cell,
-            origin,
-            distance_cost,
-            steady_bonus,
-            confirmed,
-            seeds[s],
-            match,
-        )
-        if other > score - AMBIGUITY_MARGIN:
-            agreed &= match == best
-    return agreed

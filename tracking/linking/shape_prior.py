@@ -29,7 +29,9 @@ NEAREST_SHAPES = 8  # shapes whose mean and differences give the local model
 SHAPE_MODE_SCALE = 4.0  # factor on the differences between the nearest shapes: an extrapolation this far is normal
 MAX_STRETCH_MODES = 32
 MIN_VARIANCE_RATIO = 1e-8  # of a stretching mode, relative to the largest
-RIGID_SIGMA = 5.0  # of translation and rotation [units]; that of bending is much smaller
+RIGID_SIGMA = 5.0  # of translation [units]; that of bending is much smaller
+# Of rotation [rad], and of the change of scale, which a rotation by one radian needs in a linear model.
+ROTATION_SIGMA, SCALING_SIGMA = 1.2, 0.6
 BENDING_DEGREES = 6  # polynomial degrees, from 0, of the bending modes
 STRETCH_SIGMA, STRETCH_LENGTH = 0.4, 5.0  # sigma and correlation length of stretching and shear [units]
 RIGID_HALVING_SHAPES, OTHER_HALVING_SHAPES = 5.0, 10.0  # known shapes after which a generic mode's scale has halved
@@ -38,16 +40,22 @@ NOISE_SIGMA = 0.01  # of e [units]
 CLUTTER_SIDE = 8.0  # side of the square in which an arbitrary dot may lie [units]
 
 
-class PredictedPosition(NamedTuple):
-    """Predicted positions of the markers.
+class Belief(NamedTuple):
+    """Where the markers are: a normal distribution.
 
     Attributes:
-        position: [px], (M, 2).
-        sigma: along x and along y [px], (M); infinite where nothing is known.
+        position: mean [px], (M, 2).
+        covariance: of x and y of all markers in turn [px^2], (2 M, 2 M).
     """
 
     position: Array
-    sigma: Array
+    covariance: Array
+
+    @property
+    def sigma(self) -> Array:
+        """Standard deviation along x and along y, root mean square of both [px], (M)."""
+        sigma: Array = np.sqrt(0.5 * np.diag(self.covariance).reshape(-1, 2).sum(axis=1))
+        return sigma
 
 
 class ShapePrior:
@@ -83,11 +91,10 @@ class ShapePrior:
         half = max(float(np.abs(position.real).max()), self._unit)
         modes = []
         for degree in range(BENDING_DEGREES):
-            scale = (
-                RIGID_SIGMA * self._unit * max(1.0, half / (3.0 * self._unit)) ** (degree == 1) / max(degree, 1) ** 4
-            )
+            scale = RIGID_SIGMA * self._unit / max(degree, 1) ** 4
+            along, across = (SCALING_SIGMA * half, ROTATION_SIGMA * half) if degree == 1 else (scale, scale)
             polynomial = np.polynomial.chebyshev.chebval(position / half, np.eye(BENDING_DEGREES)[degree])
-            modes += [scale * axis * polynomial, scale * axis * 1j * polynomial]
+            modes += [along * axis * polynomial, across * axis * 1j * polynomial]
         return np.stack([np.stack([mode.real, mode.imag], axis=1).ravel() for mode in modes], axis=1)
 
     def _stretching_modes(self) -> Array:
@@ -125,68 +132,41 @@ class ShapePrior:
         for shape in self._shapes:
             position = joined._rest.copy()
             position[:-1] += shape.reshape(-1, 2)
-            displacement = joined.predict(position, known).position - joined._rest
+            displacement = joined.predict(position, np.where(known, 0.0, np.inf)).position - joined._rest
             joined._shapes = np.concatenate([joined._shapes, displacement.reshape(1, -1)])
         joined._keep_every, joined._added = self._keep_every, self._added
         joined._times_seen = np.append(self._times_seen, 0.0)
         return joined
 
-    def predict(
-        self, position: Array, known: NDArray[np.bool_], guess: PredictedPosition | None = None
-    ) -> PredictedPosition:
-        """Predict the unknown markers from the known ones.
+    def predict(self, position: Array, sigma: Array) -> Belief:
+        """The belief about all markers, given where some are.
 
         Args:
-            position: of the known markers [px], (M, 2).
-            known: which these are, (M).
-            guess: of the other markers, from their own motion. Its errors may be common to all of them.
+            position: measured or predicted by the markers' own motion [px], (M, 2).
+            sigma: of the predictions [px], (M). It is 0 for measured markers and infinite where nothing is known. The
+                errors of the predictions may be common to all of them.
 
         Returns:
-            All markers. The known ones keep their position and have a sigma of 0.
+            Measured markers keep their position; their covariance is 0.
         """
+        known = sigma == 0.0
+        covariance = np.zeros((2 * len(known), 2 * len(known)))
         if known.all():
-            return PredictedPosition(position.copy(), np.zeros(len(known)))
-        predicted, weight = np.where(known[:, None], position, self._rest), known.astype(float)
-        if guess is not None:
-            variance = (~known).sum() * guess.sigma**2
-            weight = np.where(known, 1.0, self._noise**2 / (self._noise**2 + variance))  # relative to a known marker
-            predicted = np.where(known[:, None] | (weight == 0.0)[:, None], predicted, guess.position)
-        weights, hidden = np.repeat(weight, 2), np.repeat(~known, 2)
+            return Belief(position.copy(), covariance)
+        variance = (~known).sum() * sigma**2
+        weight = self._noise**2 / (self._noise**2 + variance)  # relative to a measured marker
+        predicted = np.where((weight > 0.0)[:, None], position, self._rest)
+        weights, hidden = np.repeat(weight, 2), np.flatnonzero(np.repeat(~known, 2))
         mean, modes = self._local_model(predicted, weights, ~known)
         deviation = predicted.ravel() - mean
         factor, amplitudes = self._fit(deviation, weights, modes)
         residual = deviation - modes @ amplitudes
         mean_square = ((weights * residual**2).sum() / self._noise**2 + (amplitudes**2).sum()) / max(weights.sum(), 1.0)
         spread = self._noise * solve_triangular(factor, modes[hidden].T, lower=True)
-        variance = 0.5 * (spread**2).sum(axis=0).reshape(-1, 2).sum(axis=1)
+        covariance[np.ix_(hidden, hidden)] = max(mean_square, 1.0) * (spread.T @ spread)
+        covariance[hidden, hidden] += self._noise**2
         predicted[~known] = (mean + modes @ amplitudes).reshape(-1, 2)[~known]
-        sigma = np.zeros(len(known))
-        sigma[~known] = np.sqrt(max(mean_square, 1.0) * variance + self._noise**2)
-        return PredictedPosition(predicted, sigma)
-
-    def smooth(self, position: Array, known: NDArray[np.bool_]) -> Array:
-        """The likeliest positions of all markers (M, 2), the known ones (M) included, given `position` [px], (M, 2)."""
-        weights = np.repeat(known.astype(float), 2)
-        mean, modes = self._local_model(position, weights, known)
-        smoothed: Array = (mean + modes @ self._fit(position.ravel() - mean, weights, modes)[1]).reshape(-1, 2)
-        return smoothed
-
-    def evidence(self, position: Array, known: NDArray[np.bool_]) -> tuple[float, float]:
-        """How well the prior explains positions [px], (M, 2), of the known markers (M).
-
-        Returns:
-            The logarithm of the positions' density relative to that of arbitrary dots near the body, and the mean
-            square of the normalised residuals and amplitudes. The latter is about 1 or less if the prior explains them.
-        """
-        weights = np.repeat(known.astype(float), 2)
-        mean, modes = self._local_model(position, weights, known)
-        deviation = position.ravel() - mean
-        factor, amplitudes = self._fit(deviation, weights, modes)
-        square = (weights * (deviation - modes @ amplitudes) ** 2).sum() / self._noise**2 + (amplitudes**2).sum()
-        count = weights.sum()
-        log_volume = np.log(np.diag(factor) / self._noise).sum() + count * np.log(self._noise)
-        log_ratio = count * np.log(CLUTTER_SIDE * self._unit) - 0.5 * square - log_volume
-        return float(log_ratio), float(square / max(count, 1.0))
+        return Belief(predicted, covariance)
 
     def sample_shapes(self, count: int) -> list[Array]:
         """Up to `count` of the shapes, evenly spread: positions [px], (M, 2)."""

@@ -53,7 +53,7 @@ class StaticDots:
         self._checked_displacement = farthest
         still, moving = seen & still, seen & ~still
         if still.any() and moving.sum() >= MIN_MOVING_MARKERS:
-            predicted = ShapePrior(pattern.rest).predict(positions, moving)
+            predicted = ShapePrior(pattern.rest).predict(positions, np.where(moving, 0.0, np.inf))
             deviation = np.hypot(*(predicted.position - pattern.rest).T)
             far = deviation > MIN_DEVIATION_SPACINGS * pattern.spacing
             self.mask |= still & far & (deviation > MIN_DEVIATION_SIGMAS * predicted.sigma)

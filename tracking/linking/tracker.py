@@ -23,33 +23,29 @@ from rafl.tracking.detection.detect import (
     relative_contrast,
     remove_duplicates,
 )
+from rafl.tracking.linking.assignment import assign_dots
 from rafl.tracking.linking.late_markers import LateMarker, LateMarkerFinder
-from rafl.tracking.linking.matching import MarkerPattern, match_markers
+from rafl.tracking.linking.matching import MarkerPattern
 from rafl.tracking.linking.motion_prediction import MotionPredictor
-from rafl.tracking.linking.reidentification import reidentify, unambiguous_dots
-from rafl.tracking.linking.shape_prior import PredictedPosition, ShapePrior
+from rafl.tracking.linking.shape_prior import Belief, ShapePrior
 from rafl.tracking.linking.static_dots import StaticDots
 
 Array = NDArray[Any]
 
 # "Prediction error" below: root mean square, of the best prediction order (`MotionPredictor`).
 MAX_RELIABLE_ERROR = 0.22  # prediction error up to which the dot at a predicted position is that marker's [spacings]
+MAX_CONFIRMED_ERROR = 0.1  # the same where some markers are not at their predicted positions [spacings]
 PREDICTION_GATE = 0.33  # most distance of a marker's own dot from its predicted position [spacings]
-SEED_REACH = 2.2  # most distance of a marker from its expected position in a search [spacings]
-MIN_UNAMBIGUOUS_SHARE = 0.7  # of the body's markers: with fewer unambiguous matches, `reidentify` decides
-MAX_ANCHOR_ERROR = 0.5  # prediction error up to which visible markers are not exchanged for others [spacings]
-# A reappearing marker with an unambiguous match is identified at once if its predicted position had at most this sigma
-# [spacings].
-MAX_REAPPEARING_SIGMA = 2.0
-INITIAL_MOTION_CONFIDENCE = 0.5  # 0 to 1: that markers stay near their last positions, before any motion is known
+UNKNOWN_MOTION = 0.2  # most prediction error; also that before any motion is known [spacings]
+SEARCH_SIGMAS = 3.0  # dots are searched within this many sigmas of the markers' expected positions
+STATIC_SIGMA = 0.03  # of a static dot's position about its first one [spacings]
 MIN_SHAPES = 6  # with fewer shapes, the shape prior is not relied on
 MAX_EXTRAPOLATED_FRAMES = 3  # for which a hidden marker's own motion still predicts its position
 SIGMA_GROWTH = 1.5  # factor per frame on the sigma of a hidden marker's predicted position
-# A hidden marker is searched again at the position predicted from the others if that is this far from its expected
-# position [radii], and has at most this sigma [spacings].
-MIN_SHIFT_RADII, MAX_SHIFTED_SIGMA = 0.3, 0.3
 # A dot with a larger misfit [share of the contrast] is fitted again from the median disc, in a marker's first frames.
 MAX_YOUNG_MISFIT, YOUNG_FRAMES = 0.1, 8
+# After a total loss, so many of the shapes seen so far are tried, each with errors of this sigma [spacings].
+MAX_RECALLED_SHAPES, RECALLED_SIGMA = 16, 0.5
 SEARCH_INTERVAL = 4  # frames between searches for hidden markers
 
 
@@ -75,35 +71,26 @@ class Tracker:
     def advance(self, image: Array) -> Dots:
         """The markers' dots (M) in the next frame; sigma is NaN where a marker is not visible."""
         self.frame_count += 1
-        guess = self._predict_by_motion()
-        identified, expected = self._visible_on_body() & (self.sigma == 0.0), guess.position
-        if not (identified | self.static_dots.mask).all():
-            expected = self._predict_from(expected, identified, guess).position
-        dots, unambiguous = None, np.zeros(len(expected), bool)
+        belief = self._predict_next()
+        dots = Dots.missing(len(self.sigma))
         if self.motion.errors.min() < MAX_RELIABLE_ERROR:
-            dots = self._fit_at_expected(image, expected)
+            dots = self._fit_at_expected(image, belief.position)
+        visible, shown = self.frames_missing == 0, np.isfinite(dots.sigma[:, 0])
         self.frames_since_search += 1
-        if dots is None or not self._none_lost(dots) or self.frames_since_search >= self._search_interval():
-            found, unambiguous = self._search(image, expected)
-            if dots is None or np.isfinite(found.sigma[:, 0]).sum() > np.isfinite(dots.sigma[:, 0]).sum():
-                dots = found
-            else:
-                distance = np.linalg.norm(found.centre - dots.centre, axis=1)
-                unambiguous &= distance < MIN_SEPARATION_RADII * self.appearance.radius
+        none_lost = bool(visible.any() and shown[visible].all())
+        if not none_lost or (shown & ~visible).any() or self.frames_since_search >= self._interval():
+            reliable = none_lost or self.motion.errors.min() < MAX_CONFIRMED_ERROR
+            dots = self._search(image, self._beliefs(belief), _restrict(dots, visible & reliable))
             self.frames_since_search = 0
-        if self.frames_missing.any():
-            dots = _restrict(dots, self._identify(dots, unambiguous, guess))
-            dots = self._fit_at_shifted(image, dots, expected, guess)
-            dots = _restrict(dots, self._identify(dots, unambiguous, guess))
         dots = _restrict(dots, dots.within(image))
-        self._update(dots, unambiguous, guess)
+        self._update(dots)
         return dots
 
     def skip_frame(self) -> None:
         """Advance by a frame that could not be decoded."""
-        guess, none = self._predict_by_motion(), np.zeros(len(self.frames_missing), bool)
-        positions, self.sigma = self._predict_from(guess.position, none, guess)
-        self.motion.add_frame(positions, none)
+        belief = self._predict_next()
+        positions, self.sigma = belief.position, belief.sigma
+        self.motion.add_frame(positions, np.zeros(len(positions), bool))
         self.frames_missing += 1
 
     def add_late_markers(self, number: int, image: Array) -> list[LateMarker]:
@@ -125,64 +112,62 @@ class Tracker:
 
     def _last_positions(self, marker: LateMarker, number: int) -> Array:
         """A late marker's positions in the last frames [px], (4, 2), predicted from the others where it was hidden."""
-        known, last = np.append(~self.static_dots.mask, False), []
+        sigma, last = np.append(np.where(self.static_dots.mask, np.inf, 0.0), np.inf), []
         for frame, others in enumerate(self.motion.positions, start=number + 1 - len(self.motion.positions)):
-            predicted = self.prior.predict(np.append(others, marker.rest[None], axis=0), known).position[-1]
+            predicted = self.prior.predict(np.append(others, marker.rest[None], axis=0), sigma).position[-1]
             last.append(marker.seen[frame][0] if frame in marker.seen else predicted)
         return np.array(last)
 
-    def _none_lost(self, dots: Dots) -> bool:
-        """Whether the dots show all markers that were visible in the frame before; False if none were."""
-        wanted = self.frames_missing == 0
-        return bool(wanted.any()) and not np.isnan(dots.sigma[wanted]).any()
-
-    def _search_interval(self) -> float:
+    def _interval(self) -> float:
         """Most frames between two searches."""
         return SEARCH_INTERVAL if self.frames_missing.any() else np.inf
 
-    def _predict_by_motion(self) -> PredictedPosition:
-        """The markers' positions in the next frame, from their own motion."""
-        sigma = min(float(self.motion.errors.min()), 1.0) * self.pattern.spacing
-        if self.sigma.any():
-            recent = self.frames_missing <= MAX_EXTRAPOLATED_FRAMES
-            sigma = np.where(recent, np.hypot(SIGMA_GROWTH * self.sigma, sigma), np.inf)
-        return PredictedPosition(self.motion.predict(), sigma)
+    def _motion_sigma(self) -> Array:
+        """Standard deviation of the positions predicted from the markers' own motion [px], (M)."""
+        sigma = min(float(self.motion.errors.min()), UNKNOWN_MOTION) * self.pattern.spacing
+        recent = self.frames_missing <= MAX_EXTRAPOLATED_FRAMES
+        return np.where(recent, np.hypot(SIGMA_GROWTH * self.sigma, sigma), np.inf)
+
+    def _predict_next(self) -> Belief:
+        """The belief about the next frame. Markers that were visible are expected where their motion leads."""
+        positions = self.motion.predict()
+        belief = self._predict_from(positions, self._motion_sigma())
+        own = self._visible_on_body()
+        return Belief(np.where(own[:, None], positions, belief.position), belief.covariance)
+
+    def _beliefs(self, belief: Belief) -> list[Belief]:
+        """The beliefs among which a search decides: the present one, or those about known shapes after a total loss."""
+        body = ~self.static_dots.mask
+        if self.frames_missing[body].min(initial=0) <= MAX_EXTRAPOLATED_FRAMES or not len(self.prior):
+            return [belief]
+        sigma = RECALLED_SIGMA * self.pattern.spacing
+        return [self._predict_from(shape, sigma) for shape in self.prior.sample_shapes(MAX_RECALLED_SHAPES)]
 
     def _visible_on_body(self) -> NDArray[np.bool_]:
         """The markers on the body that were visible in the frame before, (M)."""
         visible: NDArray[np.bool_] = (self.frames_missing == 0) & ~self.static_dots.mask
         return visible
 
-    def _anchors(self) -> NDArray[np.bool_]:
-        """The markers that were visible and move as predicted, so that they are not exchanged for others, (M)."""
-        reliable = self.motion.errors.min() < MAX_ANCHOR_ERROR or len(self.prior) < MIN_SHAPES
-        anchors: NDArray[np.bool_] = (self.frames_missing == 0) & (
-            self.static_dots.mask | (reliable & (self.sigma == 0.0))
-        )
-        return anchors
+    def _predict_from(self, positions: Array, sigma: Array) -> Belief:
+        """The belief about all markers, from positions [px], (M, 2), and their sigma [px], (M).
 
-    def _frames_hidden(self) -> int:
-        """Frames since any marker of the body was visible."""
-        return int(self.frames_missing[~self.static_dots.mask].min())
-
-    def _predict_from(self, positions: Array, known: NDArray[np.bool_], guess: PredictedPosition) -> PredictedPosition:
-        """All markers' positions, predicted from the known ones. Static dots stay at rest.
-
-        Args:
-            positions: of the known markers [px], (M, 2).
-            known: which these are, (M).
-            guess: the prediction from the markers' own motion.
+        See `ShapePrior.predict`. Static dots stay at rest, whatever the body does.
         """
         static = self.static_dots.mask
-        if not (known & ~static).any() and np.isinf(guess.sigma[~static]).all():
-            return PredictedPosition(self.motion.last, np.full(len(known), np.inf))
-        predicted, sigma = self.prior.predict(positions, known & ~static, guess)
-        predicted[static] = np.where(known[static, None], positions[static], self.pattern.rest[static])
-        sigma[static] = 0.0
-        return PredictedPosition(predicted, sigma)
+        belief = self.prior.predict(positions, np.where(static, np.inf, sigma))
+        if static.any():
+            rows = np.flatnonzero(np.repeat(static, 2))
+            belief.position[static] = np.where(
+                (sigma == 0.0)[static, None], positions[static], self.pattern.rest[static]
+            )
+            belief.covariance[rows], belief.covariance[:, rows] = 0.0, 0.0
+            belief.covariance[rows, rows] = np.repeat(
+                np.where(sigma == 0.0, 0.0, STATIC_SIGMA * self.pattern.spacing)[static] ** 2, 2
+            )
+        return belief
 
-    def _fit_at_expected(self, image: Array, expected: Array) -> Dots | None:
-        """The dots fitted at the expected positions (M, 2); None if too few of them belong to their markers."""
+    def _fit_at_expected(self, image: Array, expected: Array) -> Dots:
+        """The dots fitted at the expected positions (M, 2); none if too few of them belong to their markers."""
         start = self.parameters.copy()
         start[:, :2] = expected
         if self.starts_from_median.any():
@@ -195,7 +180,7 @@ class Tracker:
         reliable = _select_own_dots(
             dots.parameters, self.parameters, expected, self._visible_on_body(), self.pattern.spacing, separation, good
         )
-        return _restrict(dots, good) if reliable else None
+        return _restrict(dots, good & reliable)
 
     def _refit_from_median(self, image: Array, dots: Dots, start: Array) -> Dots:
         """The dots, those with a large misfit replaced by fits from the median disc where these have a smaller one.
@@ -219,105 +204,49 @@ class Tracker:
         shape, level = np.median(self.parameters[:, 2:5], axis=0), float(np.median(self.parameters[:, 9]))
         return initial_parameters_at(positions, shape, self.appearance.contrast, level)
 
-    def _search(self, image: Array, expected: Array) -> tuple[Dots, NDArray[np.bool_]]:
-        """Match all dots near the body to the markers at once.
-
-        Returns:
-            The markers' dots, and which of them can belong to no other marker, (M).
-        """
-        hidden = self._frames_hidden()
-        widening = 1.0 + 0.3 * min(hidden, 10)
-        margin = (SEED_REACH + 1.0) * float(np.median(self.pattern.spacing)) + 2.0 * self.appearance.radius
-        margin *= widening
-        low, high = expected.min(0) - margin, expected.max(0) + margin
-        region = int(low[0]), int(low[1]), int(high[0]), int(high[1])
+    def _search(self, image: Array, beliefs: list[Belief], own: Dots) -> Dots:
+        """The dots of the markers, by an assignment of all dots near the body. `own` are those known already, (M)."""
+        expected = np.array([belief.position for belief in beliefs])
+        margin = (
+            SEARCH_SIGMAS * np.array([belief.sigma for belief in beliefs])[..., None] + 2.0 * self.appearance.radius
+        )
+        low, high = (expected - margin).min(axis=(0, 1)), (expected + margin).max(axis=(0, 1))
+        bounds = np.concatenate([np.maximum(low, 0.0), np.minimum(high, image.shape[1::-1])]).astype(int)
         min_contrast = self.appearance.min_blob_contrast(float(np.nanmin(np.abs(self.parameters[:, 8]))))
-        blobs = find_blobs(image, self.appearance.radius, min_contrast, region)
+        blobs = find_blobs(image, self.appearance.radius, min_contrast, tuple(bounds.tolist()))
         dots = fit_dots(image, self._median_discs(blobs))
-        dots = remove_duplicates(dots[self.appearance.matches(dots)], MIN_SEPARATION_RADII * self.appearance.radius)
-        speed = np.linalg.norm(expected - self.motion.last, axis=1) / self.pattern.spacing
-        confidence = -speed - 0.2 * np.minimum(self.frames_missing, 10)
-        error = float(self.motion.errors.min())
-        motion_confidence = (
-            0.0 if hidden else 1.0 / (1.0 + (2.0 * error) ** 2) if np.isfinite(error) else INITIAL_MOTION_CONFIDENCE
-        )
-        steady_bonus = np.zeros(len(expected))
-        if (self.frames_missing > 0).any() and error < MAX_RELIABLE_ERROR:  # so that no hidden marker takes their dots
-            steady_bonus[self.frames_missing == 0] = 1.0 - error / MAX_RELIABLE_ERROR
-        match, unambiguous = match_markers(
-            self.pattern,
-            self.motion.last,
-            expected,
-            confidence,
-            dots.centre,
-            SEED_REACH * widening,
-            motion_confidence,
-            steady_bonus,
-            self._anchors(),
-            self.static_dots.mask,
-        )
-        on_body = (match >= 0) & ~self.static_dots.mask
-        if unambiguous.sum() < MIN_UNAMBIGUOUS_SHARE * (~self.static_dots.mask).sum():
-            unambiguous = (match >= 0) & self._anchors()
-            if (on_body & ~unambiguous).any() and len(dots):
-                confirmed = np.where(unambiguous, match, -1)
-                match, unambiguous = reidentify(self.prior, dots.centre, confirmed, self.pattern.spacing)
-        chosen = dots[np.maximum(match, 0)] if len(dots) else Dots.missing(len(match))
-        return _restrict(chosen, match >= 0), unambiguous
+        separation = MIN_SEPARATION_RADII * self.appearance.radius
+        dots = remove_duplicates(dots[self.appearance.matches(dots)], separation)
+        known = np.flatnonzero(np.isfinite(own.sigma[:, 0]))
+        if len(known):
+            gap = np.linalg.norm(dots.centre[:, None] - own.centre[known], axis=2)
+            dots = dots[gap.min(axis=1) > separation].extended_by(own[known])
+        if not len(dots):
+            return own
+        confirmed = np.full(len(own), -1)
+        confirmed[known] = len(dots) - len(known) + np.arange(len(known))
+        spacing = float(np.median(self.pattern.spacing))
+        match, certain = assign_dots(beliefs, dots.centre, dots.sigma.max(axis=1), confirmed, self.motion.last, spacing)
+        return _restrict(dots[np.maximum(match, 0)], certain)
 
-    def _fit_at_shifted(self, image: Array, dots: Dots, expected: Array, guess: PredictedPosition) -> Dots:
-        """The dots, with those of hidden markers that the visible ones predict elsewhere than expected."""
-        shown = np.isfinite(dots.sigma[:, 0])
-        if shown.all() or not (shown & ~self.static_dots.mask).any():
-            return dots
-        predicted, sigma = self._predict_from(dots.centre, shown, guess)
-        shifted = np.linalg.norm(predicted - expected, axis=1) > MIN_SHIFT_RADII * self.appearance.radius
-        known = sigma < MAX_SHIFTED_SIGMA * self.pattern.spacing
-        tried = np.flatnonzero(~shown & ~self.static_dots.mask & shifted & known)
-        if not len(tried):
-            return dots
-        starts = np.concatenate([self.parameters[tried], dots.parameters[shown]])
-        starts[: len(tried), :2] = predicted[tried]
-        found = fit_dots(image, starts, len(tried))
-        gap = np.linalg.norm(found.centre[:, None] - dots.centre[shown], axis=2).min(axis=1)
-        good = self.appearance.matches(found) & (gap > MIN_SEPARATION_RADII * self.appearance.radius)
-        return _replace_rows(dots, tried[good], found[good])
-
-    def _identify(self, dots: Dots, unambiguous: NDArray[np.bool_], guess: PredictedPosition) -> NDArray[np.bool_]:
-        """The visible markers whose dots can belong to no other marker, (M).
-
-        These are the anchors and the markers with an unambiguous match. Others are added one after the other, if their
-        dot is unambiguous given the position predicted from those identified so far.
-        """
-        shown = np.isfinite(dots.sigma[:, 0])
-        identified = shown & (self._anchors() | unambiguous)
-        while (shown & ~identified).any():
-            predicted = self._predict_from(dots.centre, identified, guess)
-            tried = np.flatnonzero(shown & ~identified)
-            clear = unambiguous_dots(predicted, dots.centre, tried, ~identified, self.pattern.spacing)
-            if not clear.any():
-                break
-            identified[tried[clear]] = True
-        return identified
-
-    def _update(self, dots: Dots, unambiguous: NDArray[np.bool_], guess: PredictedPosition) -> None:
+    def _update(self, dots: Dots) -> None:
         """Update the motion, the shape prior and the static dots from the frame's dots."""
         seen, positions = np.isfinite(dots.sigma[:, 0]), dots.centre
-        still_visible = seen & self._visible_on_body()
+        still_visible, reappeared = seen & self._visible_on_body(), seen & (self.frames_missing > 0)
+        guess, guess_sigma = self.motion.predict(), self._motion_sigma()
         self.motion.update_errors(positions, still_visible, self.pattern.spacing)
-        reappeared = seen & (self.frames_missing > 0)
-        if seen.all() and not reappeared.any():
+        if seen.all():
             self.sigma = np.zeros(len(seen))
         else:
-            was_known = self.sigma < MAX_REAPPEARING_SIGMA * self.pattern.spacing
-            uncertain = reappeared & ~(unambiguous & was_known)
-            sigma_of_seen = np.where(uncertain, np.minimum(self.sigma, self.pattern.spacing), 0.0)
-            positions, sigma = self._predict_from(positions, seen, guess)
-            self.sigma = np.where(seen, sigma_of_seen, sigma)
+            belief = self._predict_from(
+                np.where(seen[:, None], positions, guess), np.where(seen, 0.0, np.maximum(guess_sigma, 1e-9))
+            )
+            positions, self.sigma = belief.position, belief.sigma
         self.static_dots.update(positions, seen, self.pattern)
         body = ~self.static_dots.mask
         if 2 * (seen & body).sum() > body.sum():
-            self.prior.add_shape(self.prior.predict(positions, seen & body).position, seen)
+            sigma = np.where(seen & body, 0.0, np.inf)
+            self.prior.add_shape(self.prior.predict(positions, sigma).position, seen)
         if reappeared.any() and not still_visible.any():
             self.motion.reset()
         self.motion.add_frame(positions, reappeared)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support import curled_strip
 
-from rafl.tracking.linking.shape_prior import MAX_SHAPES, PredictedPosition, ShapePrior
+from rafl.tracking.linking.shape_prior import MAX_SHAPES, ShapePrior
 
 HIDDEN = np.arange(14) >= 8  # the three pairs at the tip
 ALL = np.ones(14, bool)
@@ -12,7 +12,7 @@ ALL = np.ones(14, bool)
 
 def hidden_errors(prior: ShapePrior, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Errors of the hidden markers' predicted positions, and the predicted standard deviations [px], (6)."""
-    predicted = prior.predict(np.where(HIDDEN[:, None], np.nan, truth), ~HIDDEN)
+    predicted = prior.predict(np.where(HIDDEN[:, None], np.nan, truth), np.where(HIDDEN, np.inf, 0.0))
     np.testing.assert_array_equal(predicted.position[~HIDDEN], truth[~HIDDEN])
     assert (predicted.sigma[~HIDDEN] == 0.0).all()
     return np.linalg.norm(predicted.position - truth, axis=1)[HIDDEN], predicted.sigma[HIDDEN]
@@ -60,10 +60,9 @@ def test_sigma_of_never_seen_markers_does_not_fall() -> None:
 
 def test_a_guess_is_weighted_by_its_sigma() -> None:
     prior, truth = prior_with(0.0, 0.1), curled_strip(0.33)
-    position = np.where(HIDDEN[:, None], np.nan, truth)
 
     def largest_error(sigma: float) -> float:
-        predicted = prior.predict(position, ~HIDDEN, PredictedPosition(truth, np.full(14, sigma)))
+        predicted = prior.predict(truth, np.where(HIDDEN, sigma, 0.0))
         return float(np.linalg.norm(predicted.position - truth, axis=1).max())
 
     assert largest_error(0.3) < 1.0
@@ -98,14 +97,13 @@ def test_one_wrong_shape_does_little_harm() -> None:
     assert hidden_errors(prior, curled_strip(0.33))[0].max() < 10.0
 
 
-def test_evidence_rejects_swapped_markers() -> None:
-    prior, truth = prior_with(*np.linspace(-0.5, 0.5, 21)), curled_strip(0.27)
-    log_density, mean_square = prior.evidence(truth, ALL)
-    swapped = truth.copy()
-    swapped[[2, 3]] = swapped[[3, 2]]
-    swapped_log_density, swapped_mean_square = prior.evidence(swapped, ALL)
-    assert swapped_log_density < log_density - 12.0
-    assert mean_square < 1.0 < 4.0 < swapped_mean_square
+def test_neighbours_errors_are_correlated() -> None:
+    """The last two pairs are hidden. Where one marker is tells more about its neighbour than about the one before."""
+    belief = prior_with(0.0, 0.1, 0.2).predict(curled_strip(0.15), np.where(np.arange(14) >= 10, np.inf, 0.0))
+    deviation = np.sqrt(np.diag(belief.covariance)[20:])
+    correlation = belief.covariance[20:, 20:] / np.outer(deviation, deviation)
+    assert np.abs(correlation[4:6, 6:]).max() > 0.8
+    np.testing.assert_allclose(belief.sigma[10:], np.hypot(deviation[::2], deviation[1::2]) / np.sqrt(2.0))
 
 
 def test_an_added_marker_is_predicted_from_the_others() -> None:
@@ -114,11 +112,11 @@ def test_an_added_marker_is_predicted_from_the_others() -> None:
     for turn in np.linspace(0.0, 0.4, 9):
         prior.add_shape(curled_strip(turn)[:-1], ALL[:-1])
     prior = prior.with_marker(rest[-1])
-    known = np.arange(14) < 13
+    known = np.where(np.arange(14) < 13, 0.0, np.inf)
     truth = curled_strip(0.3)
-    position, sigma = prior.predict(truth, known)
-    assert np.linalg.norm(position[-1] - truth[-1]) < 3.0 * sigma[-1] < 30.0
+    belief = prior.predict(truth, known)
+    assert np.linalg.norm(belief.position[-1] - truth[-1]) < 3.0 * belief.sigma[-1] < 30.0
     for turn in np.linspace(0.2, 0.4, 8):
         prior.add_shape(curled_strip(turn), ALL)
-    position, sigma = prior.predict(truth, known)
-    assert np.linalg.norm(position[-1] - truth[-1]) < min(3.0 * sigma[-1], 0.5)
+    belief = prior.predict(truth, known)
+    assert np.linalg.norm(belief.position[-1] - truth[-1]) < min(3.0 * belief.sigma[-1], 0.5)
