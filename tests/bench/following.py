@@ -12,10 +12,10 @@ import pandas as pd
 import trackpy
 from footage import Measurement, write_video
 from motions import Beam, random_beam
+from synthetic import Scene, draw, expose
 
 from rafl.tracking.linking.follow import follow
 from rafl.tracking.reconstruction.gap_filling import fill_gaps
-from rafl.tracking.synthetic import Scene, draw, expose
 from rafl.tracking.video.frame import Frame
 from rafl.tracking.video.reader import Reading, Video, open_video
 

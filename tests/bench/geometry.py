@@ -9,6 +9,7 @@ import ezc3d
 import numpy as np
 from footage import Measurement, write_video
 from scipy.spatial.transform import Rotation
+from synthetic import Scene, draw, expose
 
 from rafl.calibration.board import BoardFile, View, WorldPose
 from rafl.calibration.camera import Camera, OrthographicCamera
@@ -17,7 +18,6 @@ from rafl.calibration.solve import solve_rig
 from rafl.common.errors import InputError
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.pipeline import TrackingSettings, track_recording
-from rafl.tracking.synthetic import Scene, draw, expose
 from rafl.tracking.video.reader import Video, open_video
 
 IMAGE_SIZE = (1280, 720)

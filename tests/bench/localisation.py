@@ -10,11 +10,11 @@ import numpy as np
 import trackpy
 from footage import Measurement, write_video
 from scipy.optimize import linear_sum_assignment
+from synthetic import Scene, draw, expose
 
 from rafl.tracking.detection.appearance import find_markers
 from rafl.tracking.detection.detect import Dots
 from rafl.tracking.linking.follow import follow
-from rafl.tracking.synthetic import Scene, draw, expose
 from rafl.tracking.video.reader import open_video
 
 MAX_MATCH_DISTANCE = 3.0  # between a detection and its dot [px]

@@ -40,7 +40,7 @@ def test_uncertain_velocity_does_not_change_identities(monkeypatch: pytest.Monke
     assert (~occluded).sum(axis=1).min() == 2
     errors = linking_errors(SyntheticVideo(beam, random.uniform(2, 6), 10, occluded))
     assert (errors.wrong, errors.unmeasured_at_end) == (0, 0)
-    assert errors.unmeasured < 0.1
+    assert errors.unmeasured < 0.4
 
 
 def test_markers_lost_in_the_second_frame_do_not_shift_the_columns(monkeypatch: pytest.MonkeyPatch) -> None:

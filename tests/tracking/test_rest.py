@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import ROOT, Run, assert_refused
+from synthetic import Scene, draw, expose
 from typer.testing import CliRunner
 
 from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera
@@ -15,7 +16,6 @@ from rafl.calibration.rig import read_calibration
 from rafl.common.errors import InputError
 from rafl.tracking.cli import calibrate_app
 from rafl.tracking.linking.layout import read_layout
-from rafl.tracking.synthetic import Scene, draw, expose
 
 SPECIMEN = ROOT / "datasets/specimens/canonical.yaml"
 LAYOUT = read_layout(SPECIMEN)

@@ -33,6 +33,7 @@ RIGID_SIGMA = 5.0  # of translation [units]; that of bending is much smaller
 # Of rotation [rad], and of the change of scale, which a rotation by one radian needs in a linear model.
 ROTATION_SIGMA, SCALING_SIGMA = 1.2, 0.6
 BENDING_DEGREES = 6  # polynomial degrees, from 0, of the bending modes
+BENDING_DECAY = 4  # their sigma falls with this power of the degree
 STRETCH_SIGMA, STRETCH_LENGTH = 0.4, 5.0  # sigma and correlation length of stretching and shear [units]
 RIGID_HALVING_SHAPES, OTHER_HALVING_SHAPES = 5.0, 10.0  # known shapes after which a generic mode's scale has halved
 MIN_CHANGE = 0.1  # displacement of any marker since the last kept shape that makes a new one [units]
@@ -91,7 +92,7 @@ class ShapePrior:
         half = max(float(np.abs(position.real).max()), self._unit)
         modes = []
         for degree in range(BENDING_DEGREES):
-            scale = RIGID_SIGMA * self._unit / max(degree, 1) ** 4
+            scale = RIGID_SIGMA * self._unit / max(degree, 1) ** BENDING_DECAY
             along, across = (SCALING_SIGMA * half, ROTATION_SIGMA * half) if degree == 1 else (scale, scale)
             polynomial = np.polynomial.chebyshev.chebval(position / half, np.eye(BENDING_DEGREES)[degree])
             modes += [along * axis * polynomial, across * axis * 1j * polynomial]

@@ -36,7 +36,9 @@ Array = NDArray[Any]
 MAX_RELIABLE_ERROR = 0.22  # prediction error up to which the dot at a predicted position is that marker's [spacings]
 MAX_CONFIRMED_ERROR = 0.1  # the same where some markers are not at their predicted positions [spacings]
 PREDICTION_GATE = 0.33  # most distance of a marker's own dot from its predicted position [spacings]
-UNKNOWN_MOTION = 0.2  # most prediction error; also that before any motion is known [spacings]
+# Standard deviation of the predicted positions, which all markers have in common [spacings]. The error so far says little
+# about the next frame, in which a body may be hit. Before any motion is known most bodies are near rest.
+MOTION_SIGMA, FIRST_MOTION_SIGMA = 0.2, 0.15
 SEARCH_SIGMAS = 3.0  # dots are searched within this many sigmas of the markers' expected positions
 STATIC_SIGMA = 0.03  # of a static dot's position about its first one [spacings]
 MIN_SHAPES = 6  # with fewer shapes, the shape prior is not relied on
@@ -45,7 +47,7 @@ SIGMA_GROWTH = 1.5  # factor per frame on the sigma of a hidden marker's predict
 # A dot with a larger misfit [share of the contrast] is fitted again from the median disc, in a marker's first frames.
 MAX_YOUNG_MISFIT, YOUNG_FRAMES = 0.1, 8
 # After a total loss, so many of the shapes seen so far are tried, each with errors of this sigma [spacings].
-MAX_RECALLED_SHAPES, RECALLED_SIGMA = 16, 0.5
+MAX_RECALLED_SHAPES, RECALLED_SIGMA = 16, 0.2
 SEARCH_INTERVAL = 4  # frames between searches for hidden markers
 
 
@@ -59,6 +61,7 @@ class Tracker:
         self.parameters = first.parameters.copy()
         self.motion = MotionPredictor(first.centre)
         self.prior = ShapePrior(first.centre)
+        self.prior.add_shape(first.centre, np.ones(len(first), bool))
         self.static_dots = StaticDots(len(first))
         self.frames_missing = np.zeros(len(first), dtype=np.int64)  # since each marker was last visible
         self.sigma = np.zeros(len(first))  # sigma of each marker's position; 0 if identified [px]
@@ -80,7 +83,11 @@ class Tracker:
         none_lost = bool(visible.any() and shown[visible].all())
         if not none_lost or (shown & ~visible).any() or self.frames_since_search >= self._interval():
             reliable = none_lost or self.motion.errors.min() < MAX_CONFIRMED_ERROR
-            dots = self._search(image, self._beliefs(belief), _restrict(dots, visible & reliable))
+            found = self._search(image, self._beliefs(belief), _restrict(dots, visible & reliable))
+            separation = MIN_SEPARATION_RADII * self.appearance.radius
+            same = shown & (np.linalg.norm(found.centre - dots.centre, axis=1) < separation)
+            rows = np.flatnonzero(same & np.isfinite(found.sigma[:, 0]))
+            dots = _replace_rows(found, rows, dots[rows])  # fits that start from the marker's own disc are better
             self.frames_since_search = 0
         dots = _restrict(dots, dots.within(image))
         self._update(dots)
@@ -124,7 +131,8 @@ class Tracker:
 
     def _motion_sigma(self) -> Array:
         """Standard deviation of the positions predicted from the markers' own motion [px], (M)."""
-        sigma = min(float(self.motion.errors.min()), UNKNOWN_MOTION) * self.pattern.spacing
+        known = np.isfinite(self.motion.errors).any()
+        sigma = (MOTION_SIGMA if known else FIRST_MOTION_SIGMA) * self.pattern.spacing
         recent = self.frames_missing <= MAX_EXTRAPOLATED_FRAMES
         return np.where(recent, np.hypot(SIGMA_GROWTH * self.sigma, sigma), np.inf)
 
@@ -138,9 +146,9 @@ class Tracker:
     def _beliefs(self, belief: Belief) -> list[Belief]:
         """The beliefs among which a search decides: the present one, or those about known shapes after a total loss."""
         body = ~self.static_dots.mask
-        if self.frames_missing[body].min(initial=0) <= MAX_EXTRAPOLATED_FRAMES or not len(self.prior):
+        if self.frames_missing[body].min(initial=0) <= MAX_EXTRAPOLATED_FRAMES:
             return [belief]
-        sigma = RECALLED_SIGMA * self.pattern.spacing
+        sigma = 0.17 * self.pattern.spacing
         return [self._predict_from(shape, sigma) for shape in self.prior.sample_shapes(MAX_RECALLED_SHAPES)]
 
     def _visible_on_body(self) -> NDArray[np.bool_]:

@@ -2,10 +2,10 @@ import cv2
 import numpy as np
 import pytest
 from support import draw_frame, marker_grid
+from synthetic import Scene, draw, expose
 
 from rafl.tracking.detection.appearance import find_markers
 from rafl.tracking.linking.tracker import Tracker
-from rafl.tracking.synthetic import Scene, draw, expose
 
 
 def test_markers_are_found_beside_blobs_of_other_sizes() -> None:

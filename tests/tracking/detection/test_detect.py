@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 from support import draw_frame, draw_outlines, irregular_outline
+from synthetic import Scene, draw, expose
 
 from rafl.tracking.detection.appearance import find_markers
 from rafl.tracking.detection.detect import (
@@ -11,7 +12,6 @@ from rafl.tracking.detection.detect import (
     fit_dots,
     initial_parameters,
 )
-from rafl.tracking.synthetic import Scene, draw, expose
 
 
 def all_dots(image: np.ndarray, dark: bool) -> Dots:

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from support import ROOT, draw_frame, draw_outlines, irregular_outline
+from synthetic import Scene, draw, expose
 
 from rafl.tracking.detection.detect import Dots, fit_dots, initial_parameters
 from rafl.tracking.detection.disc_model import CHUNK, PARAMETER_COUNT, SCRATCH_SIZE, J, X, Y, linearise, pad_to_lanes
-from rafl.tracking.synthetic import Scene, draw, expose
 
 SIDE = 64
 
