@@ -185,6 +185,24 @@ def _read_image(path: Path, strict: bool = False) -> Array | None:
         return None
 
 
+def folder_images(folder: Path) -> tuple[list[Path], Callable[[Path], Array | None]]:
+    """The images of a folder in order, and a function that reads one.
+
+    It returns grey levels from 0 to 255, (H, W); None for an unreadable file.
+    """
+    paths = _image_paths(folder)
+    read_image = _image_reader(paths)
+    first = next((image for image in map(read_image, paths) if image is not None), None)
+    # A 16-bit file may hold 10, 12 or 14 bits; the first image decides.
+    bits = 8 if first is None else next(b for b in (8, 10, 12, 14, 16) if int(first.max()) < 2**b)
+
+    def read(path: Path) -> Array | None:
+        image = read_image(path)
+        return image if image is None or image.dtype == np.uint8 else scale_to_eight_bits(image, bits)
+
+    return paths, read
+
+
 def _read_folder(folder: Path) -> Generator[Frame]:
     """Yield the images of a folder as frames without times; unreadable ones have no image.
 
@@ -192,18 +210,13 @@ def _read_folder(folder: Path) -> Generator[Frame]:
         InputError: the images differ in size.
     """
     shape: tuple[int, ...] | None = None
-    bits = 8
-    paths = _image_paths(folder)
-    read_image = _image_reader(paths)
+    paths, read_image = folder_images(folder)
     for path in paths:
         image = read_image(path)
         if image is None:
             yield Frame(np.nan, None)
             continue
-        if shape is None:
-            # A 16-bit file may hold 10, 12 or 14 bits; the first image decides.
-            bits = next(b for b in (8, 10, 12, 14, 16) if int(image.max()) < 2**b)
-        elif image.shape != shape:
+        if shape is not None and image.shape != shape:
             raise InputError(f"expected images of one size in {folder}, found another size in {path.name}; remove it")
         shape = image.shape
-        yield Frame(np.nan, image if image.dtype == np.uint8 else scale_to_eight_bits(image, bits))
+        yield Frame(np.nan, image)
