@@ -12,7 +12,7 @@ from rafl.calibration.camera import Camera, OrthographicCamera, Perspective, Pin
 from rafl.calibration.fields import Direction, PositivePair
 from rafl.common.files import write_text
 from rafl.common.names import Name, check_distinct, require_names
-from rafl.common.yaml_files import StrictModel, read_yaml
+from rafl.common.yaml_files import StrictModel, parse_yaml_text, read_yaml
 
 FORMAT = "rafl-calibration/1"
 PLANE_SIGMA_MM = 0.5  # of the markers' distances from their plane, unless given
@@ -146,6 +146,20 @@ def read_calibration(path: str | Path) -> Rig:
     """
     path = Path(path)
     content = read_yaml(path, _RigFile, "a calibration (calib.yaml)", FORMAT)
+    return Rig({name: entry.camera() for name, entry in content.cameras.items()})
+
+
+def parse_calibration(text: str, source: Path) -> Rig:
+    """The rig that the content of `calib.yaml` describes.
+
+    Args:
+        text: the content, as `rig_text` writes it.
+        source: the file that holds it, for error messages.
+
+    Raises:
+        InputError: the text is damaged or of a newer version.
+    """
+    content = parse_yaml_text(text, _RigFile, "a calibration", FORMAT, source)
     return Rig({name: entry.camera() for name, entry in content.cameras.items()})
 
 

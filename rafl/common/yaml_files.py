@@ -37,7 +37,26 @@ def read_yaml(path: Path, model: type[Model], label: str, version: str) -> Model
         InputError: the file does not exist, is not YAML, has another format or a newer version, has an unknown or
             missing key, or has a value of the wrong type.
     """
-    content = read_yaml_content(path, label, version)
+    return _validated(read_yaml_content(path, label, version), model, label, path)
+
+
+def parse_yaml_text(text: str, model: type[Model], label: str, version: str, source: Path) -> Model:
+    """Validate a YAML text that a file holds: `read_yaml` without the file.
+
+    Args:
+        text: to parse.
+        model: class that the content is validated against.
+        label: name of the text's kind in error messages.
+        version: expected format, `name/number`.
+        source: the file, for error messages.
+
+    Raises:
+        InputError: as for `read_yaml`.
+    """
+    return _validated(_parsed_content(text, label, version, source), model, label, source)
+
+
+def _validated(content: dict[str, Any], model: type[Model], label: str, path: Path) -> Model:
     try:
         return model.model_validate(content)
     except pydantic.ValidationError as error:
@@ -74,7 +93,20 @@ def read_yaml_content(path: Path, label: str, version: str) -> dict[str, Any]:
             "right file?"
         )
     try:
-        content = parse_yaml(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+    except ValueError as error:
+        raise InputError(f"expected {label} in {path}, which is not readable as YAML: {error}; correct it") from None
+    return _parsed_content(text, label, version, path)
+
+
+def _parsed_content(text: str, label: str, version: str, path: Path) -> dict[str, Any]:
+    """Keys and values of a YAML text of the expected format.
+
+    Raises:
+        InputError: no YAML, or another format or a newer version.
+    """
+    try:
+        content = parse_yaml(text)
     # RecursionError: hundreds of nested brackets. ValueError: an impossible date, a number of thousands of digits.
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         reason = " ".join(str(error).split())

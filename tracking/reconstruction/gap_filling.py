@@ -20,7 +20,9 @@ CORRELATION_FRAMES = 2.5  # over which the regression's residuals are correlated
 RESIDUAL_WINDOW = 8  # frames on either side of a gap whose residuals are used
 
 
-def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple[Array, Array, NDArray[np.uint8]]:
+def fill_gaps(
+    position: Array, sigma: Array, time: Array, longest: int, chosen: NDArray[np.bool_] | None = None
+) -> tuple[Array, Array, NDArray[np.uint8]]:
     """Fill gaps of up to `longest` frames; longer ones stay NaN.
 
     All markers ride on one body that moves in a few modes. If others are seen in the gap, the marker is predicted from
@@ -32,6 +34,7 @@ def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple
         sigma: [m], (T, M, 3).
         time: [s], (T).
         longest: longest gap to fill [frames].
+        chosen: only gaps with such a frame are filled, (T, M); all if None.
 
     Returns:
         Positions, sigma (T, M, 3) and states (T, M): 0 missing, 1 measured, 2 filled.
@@ -41,10 +44,12 @@ def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple
     filled, grown = position.copy(), sigma.copy()
     for marker in range(position.shape[1]):
         frames = np.flatnonzero(seen[:, marker])
-        if len(frames) < 4 or longest == 0:
+        if len(frames) < 4 or longest == 0 or not (chosen is None or chosen[:, marker].any()):
             continue
         for before, after in itertools.pairwise(frames.tolist()):
             if not 1 < after - before <= longest + 1:
+                continue
+            if chosen is not None and not chosen[before + 1 : after, marker].any():
                 continue
             ends = np.maximum(sigma[before, marker], sigma[after, marker]) ** 2
             gap = np.arange(before + 1, after)
@@ -56,6 +61,40 @@ def fill_gaps(position: Array, sigma: Array, time: Array, longest: int) -> tuple
                 grown[part, marker] = np.sqrt(np.maximum(bridge[1], 1.5 * ends))
             state[gap, marker] = FILLED
     return filled, grown, state
+
+
+def refill_gaps(
+    position: Array, sigma: Array, state: NDArray[np.uint8], time: Array, longest: int, changed: NDArray[np.bool_]
+) -> tuple[Array, Array, NDArray[np.uint8]]:
+    """Fill those gaps anew that have, or border on, a measurement that was changed; all else stays.
+
+    Args:
+        position: [m], (T, M, 3), NaN where missing.
+        sigma: [m], (T, M, 3).
+        state: (T, M), in which changed measurements are 0 or 1.
+        time: [s], (T).
+        longest: longest gap to fill [frames].
+        changed: which measurements were changed, (T, M).
+
+    Returns:
+        As `fill_gaps`.
+    """
+    measured = state == MEASURED
+    anew = np.zeros_like(measured)
+    for marker in np.flatnonzero(changed.any(axis=0)):
+        padded = np.r_[True, measured[:, marker], True]
+        first = np.flatnonzero(padded[:-1] & ~padded[1:])
+        last = np.flatnonzero(~padded[:-1] & padded[1:])
+        for begin, end in zip(first.tolist(), last.tolist(), strict=True):
+            anew[begin:end, marker] = changed[max(begin - 1, 0) : end + 1, marker].any()
+    known = np.where(measured[..., None], position, np.nan)
+    filled, grown, new = fill_gaps(known, sigma, time, longest, anew)
+    kept = ~(anew | measured)[..., None]
+    return (
+        np.where(kept, position, filled),
+        np.where(kept, sigma, np.where((new > 0)[..., None], grown, np.nan)),
+        np.where(kept[..., 0], state, new),
+    )
 
 
 def _split_by_seen(gap: NDArray[np.int64], seen: NDArray[np.bool_]) -> list[NDArray[np.int64]]:

@@ -1,6 +1,7 @@
 """The tracks file: 3-D markers of one recording over time."""
 
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -35,6 +36,7 @@ CAMERA_ARRAYS = {
     "pixel_sigma": ArrayFormat(("T", "M", 2), finite=False, low=0.0),
     "damaged": ArrayFormat(("T",), "truth"),
     "frame": ArrayFormat(("T",), "integer", low=-1),
+    "lag": ArrayFormat(("T",), optional=True),
 }
 PICTURE = ArrayFormat(("bytes",), "integer", low=0, high=255)
 
@@ -61,6 +63,9 @@ class Tracks:
         settings: text of the settings used.
         notes: on contradictory video data, damaged frames and clock delays.
         version: of the program that tracked.
+        videos: by camera, the path of the video; empty where not known, as in files of earlier programs.
+        lag: by camera, time of the frame shown minus that of the row [s], (T); empty where not known.
+        longest_gap: that was filled [frames]; None where not known.
 
     Raises:
         InputError: the name of a marker or camera is invalid.
@@ -83,6 +88,9 @@ class Tracks:
     settings: str
     notes: tuple[str, ...] = ()
     version: str = VERSION
+    videos: dict[str, str] = field(default_factory=dict)
+    lag: dict[str, Array] = field(default_factory=dict)
+    longest_gap: int | None = None
 
     def __post_init__(self) -> None:
         require_names(self.names, "markers of tracks")
@@ -123,11 +131,16 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
                 "sources": np.array(sources, h5py.string_dtype()),
             }
         )
+        if tracks.longest_gap is not None:
+            file.attrs["longest_gap"] = tracks.longest_gap
         for key in TRACKS_ARRAYS:
             file.create_dataset(key, data=getattr(tracks, key), fletcher32=True)
         for name in tracks.pixel:
             for key in CAMERA_ARRAYS:
-                file.create_dataset(f"cameras/{name}/{key}", data=getattr(tracks, key)[name], fletcher32=True)
+                if name in getattr(tracks, key):
+                    file.create_dataset(f"cameras/{name}/{key}", data=getattr(tracks, key)[name], fletcher32=True)
+            if name in tracks.videos:
+                file[f"cameras/{name}"].attrs["video"] = os.path.relpath(tracks.videos[name], path.parent)
             for number, image in sorted(tracks.images[name].items()):
                 file[f"cameras/{name}/pictures/{number}"] = np.frombuffer(image, np.uint8)
 
@@ -141,7 +154,7 @@ def read_tracks(path: str | Path) -> Tracks:
     path = Path(path)
     with read_hdf5(path, LABEL, "track again") as file:
         check_format(str(file.attrs.get("format", "")), FORMAT, path)
-        return _read(file)
+        return _read(file, path.parent)
 
 
 class _FileAttributes(pydantic.BaseModel):
@@ -156,10 +169,11 @@ class _FileAttributes(pydantic.BaseModel):
     software: str
     notes: tuple[str, ...]
     sources: tuple[Annotated[str, pydantic.Field(pattern="^[0-9a-f]+  ")], ...]
+    longest_gap: int | None = pydantic.Field(None, ge=0)
 
 
-def _read(file: h5py.File) -> Tracks:
-    """The content of an open file.
+def _read(file: h5py.File, folder: Path) -> Tracks:
+    """The content of an open file in a folder.
 
     Raises:
         ValueError: a part differs from its description, or parts contradict one another.
@@ -186,7 +200,7 @@ def _read(file: h5py.File) -> Tracks:
         position=arrays["position"],
         sigma=arrays["sigma"],
         state=arrays["state"].astype(np.uint8),
-        **{key: {name: found[key] for name, found in by_camera.items()} for key in CAMERA_ARRAYS},
+        **{key: {name: found[key] for name, found in by_camera.items() if key in found} for key in CAMERA_ARRAYS},
         images={name: _read_images(group, f"cameras/{name}/pictures") for name, group in cameras.items()},
         fps=about.fps,
         calibration=about.calibration,
@@ -194,6 +208,12 @@ def _read(file: h5py.File) -> Tracks:
         settings=about.settings,
         notes=about.notes,
         version=about.software.removeprefix("rafl "),
+        videos={
+            name: os.path.normpath(folder / str(group.attrs["video"]))
+            for name, group in cameras.items()
+            if "video" in group.attrs
+        },
+        longest_gap=about.longest_gap,
     )
 
 

@@ -96,15 +96,23 @@ def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array
         InputError: a camera without a plane sees markers alone, and no marker is seen by several cameras.
     """
     seen = {name: np.isfinite(item.sigma[..., 0]) for name, item in pixels.items()}
+    alone = _count(seen) == 1
+    for name in pixels:
+        if rig.cameras[name].plane is None and (seen[name] & alone).any() and not (_count(seen) > 1).any():
+            raise InputError(
+                f"camera {name} alone sees the markers, and the calibration gives it no plane; name the "
+                "markers with --specimen, or add `plane: {normal: ..., offset_mm: ...}` to the camera in calib.yaml"
+            )
+    return triangulate_some(rig, pixels)
+
+
+def triangulate_some(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array, dict[str, Array]]:
+    """`triangulate` for a part of a recording, in which no marker need be seen by enough cameras."""
+    seen = {name: np.isfinite(item.sigma[..., 0]) for name, item in pixels.items()}
     ideal = {name: rig.cameras[name].undistort(item.pixel) for name, item in pixels.items()}
     alone = _count(seen) == 1
     for name in pixels:
         if rig.cameras[name].plane is None:
-            if (seen[name] & alone).any() and not (_count(seen) > 1).any():
-                raise InputError(
-                    f"camera {name} alone sees the markers, and the calibration gives it no plane; name the "
-                    "markers with --specimen, or add `plane: {normal: ..., offset_mm: ...}` to the camera in calib.yaml"
-                )
             seen[name] = seen[name] & ~alone
     solution = _Solution.of(rig, pixels, ideal, seen)
     excess = _excess(rig, pixels, seen, solution.position)

@@ -1,0 +1,290 @@
+"""Tracks with corrections: pixels are changed camera by camera, and what depends on them is computed anew."""
+
+from dataclasses import dataclass, replace
+from functools import singledispatchmethod
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rafl.calibration.rig import parse_calibration
+from rafl.common.errors import InputError
+from rafl.tracking.reconstruction.corrections import (
+    Accept,
+    Correction,
+    Delete,
+    Place,
+    Rename,
+    Swap,
+    corrections_path,
+    read_corrections,
+)
+from rafl.tracking.reconstruction.gap_filling import FILLED, MEASURED, MISSING, refill_gaps
+from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
+from rafl.tracking.reconstruction.triangulation import SAME_TIME_FRAMES, CameraPixels, triangulate_some
+
+Array = NDArray[Any]
+
+LAG_ERROR = 0.5  # of the distance that a dot moves between the time of its frame and that of the row
+
+
+@dataclass(frozen=True)
+class CorrectedTracks:
+    """Tracks with the corrections of a person.
+
+    Attributes:
+        tracks: with the corrections.
+        corrections: those in the file.
+        changed: whether a camera's pixel of the marker was changed, (T, M).
+        accepted: whether somebody has accepted the marker as it is there, (T, M).
+        unfit: a line for each correction that does not fit the tracks and was left out.
+    """
+
+    tracks: Tracks
+    corrections: tuple[Correction, ...]
+    changed: NDArray[np.bool_]
+    accepted: NDArray[np.bool_]
+    unfit: tuple[str, ...]
+
+
+def read_corrected_tracks(path: str | Path) -> CorrectedTracks:
+    """Read a tracks file and apply the corrections in `<recording>.corrections.yaml` beside it, if there is one.
+
+    Corrections that do not fit the tracks are left out; the tracks' notes name them.
+
+    Raises:
+        InputError: a file is damaged, or there are corrections for tracks without a calibration.
+    """
+    path = Path(path)
+    return with_corrections(read_tracks(path), path)
+
+
+def with_corrections(tracks: Tracks, path: Path) -> CorrectedTracks:
+    """Tracks with the corrections that lie beside the tracks file at `path`.
+
+    Raises:
+        InputError: as for `read_corrected_tracks`.
+    """
+    beside = corrections_path(path)
+    found = apply_corrections(tracks, read_corrections(beside), path)
+    if not found.corrections:
+        return found
+    applied = len(found.corrections) - len(found.unfit)
+    notes = (f"{applied} correction{'' if applied == 1 else 's'} of {beside.name} applied", *found.unfit)
+    return replace(found, tracks=replace(found.tracks, notes=(*tracks.notes, *notes)))
+
+
+def apply_corrections(tracks: Tracks, corrections: tuple[Correction, ...], source: Path) -> CorrectedTracks:
+    """Apply corrections one after the other, and reconstruct the markers anew in the frames concerned.
+
+    Gaps that have, or border on, a corrected measurement are filled anew.
+
+    Args:
+        tracks: as tracked.
+        corrections: in order.
+        source: the tracks file, for error messages.
+
+    Raises:
+        InputError: the tracks hold no calibration.
+    """
+    work = _Work(tracks)
+    unfit = []
+    for number, correction in enumerate(corrections, start=1):
+        try:
+            work.apply(correction)
+        except _UnfitError as error:
+            unfit.append(f"correction {number} ({correction.kind}, by {correction.by}) is left out: {error}")
+    result = work.tracks
+    if work.changed.any():
+        if not tracks.calibration:
+            raise InputError(f"{source}: expected the calibration with which it was tracked, found none; track again")
+        result = _reconstruct(result, work.changed, source)
+    if (emptied := work.emptied & (result.state == FILLED)).any():
+        nowhere = np.where(emptied[..., None], np.nan, 0.0)
+        result = replace(
+            result,
+            position=result.position + nowhere,
+            sigma=result.sigma + nowhere,
+            state=np.where(emptied, np.uint8(MISSING), result.state),
+        )
+    return CorrectedTracks(result, corrections, work.changed, work.accepted, tuple(unfit))
+
+
+class _UnfitError(Exception):
+    """A correction does not fit the tracks."""
+
+
+class _Work:
+    """Tracks whose pixels are being corrected; arrays are copied before they are changed."""
+
+    def __init__(self, tracks: Tracks) -> None:
+        pixel = {camera: values.copy() for camera, values in tracks.pixel.items()}
+        sigma = {camera: values.copy() for camera, values in tracks.pixel_sigma.items()}
+        self.tracks = replace(tracks, pixel=pixel, pixel_sigma=sigma)
+        self.changed = np.zeros(tracks.state.shape, bool)
+        self.accepted = np.zeros(tracks.state.shape, bool)
+        self.emptied = np.zeros(tracks.state.shape, bool)  # where no gap is filled
+        self.rows: dict[str, dict[int, int]] = {}
+
+    @singledispatchmethod
+    def apply(self, correction: Correction) -> None:
+        """Apply a correction.
+
+        Raises:
+            _UnfitError: it does not fit.
+        """
+        raise NotImplementedError
+
+    @apply.register
+    def _(self, correction: Place) -> None:
+        camera = self._camera(correction.camera)
+        values = correction.positions
+        row_of = self.rows.setdefault(camera, self.tracks.rows_by_frame(camera))
+        frames = values[:, 0].astype(int).tolist()
+        absent = [frame for frame in frames if frame not in row_of]
+        if absent:
+            raise _UnfitError(f"no row of the tracks shows frame {absent[0]} of camera {camera}")
+        if correction.new and correction.marker not in self.tracks.names:
+            self._add_marker(correction.marker)
+        column = self._column(correction.marker)
+        rows = np.array([row_of[frame] for frame in frames])
+        pixel, sigma = self._at_row_times(camera, column, rows, values[:, 1:3], values[:, 3:])
+        self.tracks.pixel[camera][rows, column] = pixel
+        self.tracks.pixel_sigma[camera][rows, column] = sigma
+        self.changed[rows, column] = True
+
+    @apply.register
+    def _(self, correction: Delete) -> None:
+        rows, column = self._stretch(correction)
+        camera = correction.camera
+        seen = np.isfinite(self.tracks.pixel_sigma[camera][:, column, 0])
+        if not (rows & seen).any():  # what is deleted is a filled gap
+            self.emptied[rows, column] = True
+        rows &= seen
+        self.tracks.pixel[camera][rows, column] = np.nan
+        self.tracks.pixel_sigma[camera][rows, column] = np.nan
+        self.changed[rows, column] = True
+
+    @apply.register
+    def _(self, correction: Accept) -> None:
+        rows, column = self._stretch(correction)
+        self.accepted[rows, column] = True
+
+    @apply.register
+    def _(self, correction: Swap) -> None:
+        camera = self._camera(correction.camera)
+        pair = [self._column(marker) for marker in correction.markers]
+        frame = self.tracks.frame[camera]
+        if frame.max() < correction.first:
+            raise _UnfitError(f"camera {camera} has frames up to {frame.max()}, not {correction.first}")
+        rows = np.arange(len(frame)) >= int(np.argmax(frame >= correction.first))
+        for values in (self.tracks.pixel[camera], self.tracks.pixel_sigma[camera]):
+            values[np.ix_(rows, pair)] = values[np.ix_(rows, pair[::-1])]
+        seen = np.isfinite(self.tracks.pixel_sigma[camera][:, pair, 0]).any(axis=1)
+        self.changed[np.ix_(rows & seen, pair)] = True
+
+    @apply.register
+    def _(self, correction: Rename) -> None:
+        column = self._column(correction.marker)
+        names = list(self.tracks.names)
+        if correction.to in names:
+            raise _UnfitError(f"there is a marker {correction.to} already")
+        names[column] = correction.to
+        try:
+            self.tracks = replace(self.tracks, names=tuple(names))
+        except InputError as error:
+            raise _UnfitError(str(error)) from None
+
+    def _camera(self, camera: str) -> str:
+        if camera not in self.tracks.pixel:
+            raise _UnfitError(f"the tracks have no camera {camera}")
+        return camera
+
+    def _column(self, marker: str) -> int:
+        if marker not in self.tracks.names:
+            raise _UnfitError(f"the tracks have no marker {marker}")
+        return self.tracks.names.index(marker)
+
+    def _stretch(self, correction: Delete | Accept) -> tuple[NDArray[np.bool_], int]:
+        frame = self.tracks.frame[self._camera(correction.camera)]
+        column = self._column(correction.marker)
+        rows = (frame >= correction.first) & (frame <= correction.last)
+        if correction.last > frame.max() or not rows.any():
+            raise _UnfitError(
+                f"camera {correction.camera} has frames up to {frame.max()}, not {correction.first} to "
+                f"{correction.last}"
+            )
+        return rows, column
+
+    def _add_marker(self, marker: str) -> None:
+        """Add a marker that is missing everywhere, as the last one."""
+        tracks = self.tracks
+
+        def wider(values: Array) -> Array:
+            empty: float = np.nan if values.dtype.kind == "f" else MISSING
+            return np.concatenate([values, np.full_like(values[:, :1], empty)], axis=1)
+
+        try:
+            self.tracks = replace(
+                tracks,
+                names=(*tracks.names, marker),
+                **{key: wider(getattr(tracks, key)) for key in ("position", "sigma", "state")},
+                **{
+                    key: {camera: wider(values) for camera, values in getattr(tracks, key).items()}
+                    for key in ("pixel", "pixel_sigma", "residual")
+                },
+            )
+        except InputError as error:
+            raise _UnfitError(str(error)) from None
+        for key in ("changed", "accepted", "emptied"):
+            setattr(self, key, np.pad(getattr(self, key), ((0, 0), (0, 1))))
+
+    def _at_row_times(
+        self, camera: str, column: int, rows: NDArray[np.int64], pixel: Array, sigma: Array
+    ) -> tuple[Array, Array]:
+        """Pixels and sigmas (F, 2) at the times of rows (F), of a dot that was seen in the frames shown there.
+
+        A camera whose clock is offset shows its frames a little earlier or later than the rows.
+        """
+        lag = self.tracks.lag.get(camera)
+        if lag is None or (np.abs(lag[rows]) * self.tracks.fps < SAME_TIME_FRAMES).all():
+            return pixel, sigma
+        path, time = self.tracks.pixel[camera], self.tracks.time
+        before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(time) - 1)
+        velocity = (path[after] - path[before]) / (time[after] - time[before])[:, None, None]
+        own = velocity[:, column]
+        others = np.ma.median(np.ma.masked_invalid(velocity), axis=1).filled(0.0)
+        shift = lag[rows, None] * np.where(np.isfinite(own), own, others)
+        return pixel - shift, np.hypot(sigma, LAG_ERROR * shift)
+
+
+def _reconstruct(tracks: Tracks, changed: NDArray[np.bool_], source: Path) -> Tracks:
+    """The tracks, with positions triangulated from the pixels where `changed`, (T, M)."""
+    rig = parse_calibration(tracks.calibration, source)
+    rows, columns = np.nonzero(changed)
+    pixels = {
+        camera: CameraPixels(tracks.pixel[camera][rows, columns][None], tracks.pixel_sigma[camera][rows, columns][None])
+        for camera in tracks.pixel
+    }
+    found, found_sigma, found_residual = triangulate_some(rig, pixels)
+    position, sigma, state = tracks.position.copy(), tracks.sigma.copy(), tracks.state.copy()
+    residual = {camera: values.copy() for camera, values in tracks.residual.items()}
+    position[rows, columns], sigma[rows, columns] = found[0], found_sigma[0]
+    state[rows, columns] = np.where(np.isfinite(found[0, :, 0]), MEASURED, MISSING)
+    for camera, values in residual.items():
+        values[rows, columns] = found_residual[camera][0]
+    longest = tracks.longest_gap
+    position, sigma, state = refill_gaps(
+        position, sigma, state, tracks.time, _longest_filled(tracks.state) if longest is None else longest, changed
+    )
+    return replace(tracks, position=position, sigma=sigma, state=state, residual=residual)
+
+
+def _longest_filled(state: NDArray[np.uint8]) -> int:
+    """Length of the longest filled gap, (T, M): files of earlier programs do not say up to which gaps were filled."""
+    longest = 0
+    for filled in (state == FILLED).T:
+        edges = np.flatnonzero(np.diff(np.r_[False, filled, False]))
+        longest = max(longest, int((edges[1::2] - edges[::2]).max(initial=0)))
+    return longest
