@@ -12,6 +12,7 @@ from rafl.common.version import VERSION
 if TYPE_CHECKING:
     from rafl.api import (
         CaptureSettings,
+        CorrectedTracks,
         Dataset,
         FittedModel,
         HexMesh,
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
         load_model,
         predict,
         read_calibration,
+        read_corrected_tracks,
         read_dataset,
         read_specimen,
         read_tracks,
@@ -52,6 +54,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "CaptureSettings",
+    "CorrectedTracks",
     "Dataset",
     "FittedModel",
     "HexMesh",
@@ -79,6 +82,7 @@ __all__ = [
     "load_model",
     "predict",
     "read_calibration",
+    "read_corrected_tracks",
     "read_dataset",
     "read_specimen",
     "read_tracks",

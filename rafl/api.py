@@ -39,11 +39,13 @@ from rafl.simulation.simulator import Simulator
 from rafl.tracking.linking.layout import read_layout
 from rafl.tracking.linking.naming import with_face_planes
 from rafl.tracking.pipeline import TrackingSettings, track_recording
+from rafl.tracking.reconstruction.corrected_tracks import CorrectedTracks, read_corrected_tracks
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
 from rafl.tracking.video.recordings import filmed_cameras, find_recordings
 
 __all__ = [
     "CaptureSettings",
+    "CorrectedTracks",
     "Dataset",
     "FittedModel",
     "HexMesh",
@@ -70,6 +72,7 @@ __all__ = [
     "load_model",
     "predict",
     "read_calibration",
+    "read_corrected_tracks",
     "read_dataset",
     "read_specimen",
     "read_tracks",

@@ -91,6 +91,30 @@ def test_recordings_are_tracked_again_only_if_something_changed(videos: Path, ru
     assert {item.name for item in (tmp_path / "tracks").iterdir()} == exports
 
 
+def test_corrections_are_applied_again_whenever_tracks_are_made(videos: Path, run: Run, tmp_path: Path) -> None:
+    """They are in exports and notes, and the tracks file is as tracked; one that does not fit is named."""
+    command = ("rafl-track", videos, "--calib", "calib.yaml", "--fps", "50", "--export", "csv")
+    assert run(*command).returncode == 0
+    raw = (tmp_path / "tracks/swing.h5").read_bytes()
+    beside = tmp_path / "tracks/swing.corrections.yaml"
+    entry = "{kind: rename, by: Ann, at: 2026-01-02T03:04:05+00:00, camera: front, marker: %s, to: Tip}"
+    lines = "".join(f"- {entry % marker}\n" for marker in ("r1c1", "r9c9"))
+    beside.write_text(f"format: rafl-corrections/1\ncorrections:\n{lines}")
+    for again in (command, (*command, "--fill", "2")):
+        result = run(*again)
+        assert result.returncode == 0, result.stderr
+        text = " ".join(result.stdout.split())
+        assert "1 correction of swing.corrections.yaml applied" in text
+        assert "correction 2 (rename, by Ann) is left out: the tracks have no marker r9c9" in text
+        assert ",Tip," in (tmp_path / "tracks/swing.csv").read_text()
+        if again == command:
+            assert (tmp_path / "tracks/swing.h5").read_bytes() == raw
+        with h5py.File(tmp_path / "tracks/swing.h5") as file:
+            assert "r1c1" in list(file.attrs["marker_names"])
+    beside.write_text("format: rafl-corrections/2\n")
+    assert_refused(run(*command), "swing.corrections.yaml", "newer")
+
+
 def test_track_refuses_too_few_markers(videos: Path, run: Run, tmp_path: Path) -> None:
     for path in (videos / "swing").iterdir():
         cv2.imwrite(str(path), draw_frame([(60.0, 60.0, 6.0, 6.0, 0.0), (120.0, 60.0, 6.0, 6.0, 0.0)], noise=1.0))

@@ -27,6 +27,7 @@ from rafl.tracking.linking.layout import read_layout
 from rafl.tracking.linking.naming import with_face_planes
 from rafl.tracking.overlay import write_overlay
 from rafl.tracking.pipeline import TrackingSettings, existing_tracks, track_recording
+from rafl.tracking.reconstruction.corrected_tracks import with_corrections
 from rafl.tracking.reconstruction.export import WRITERS, export_name
 from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 from rafl.tracking.report import summary_cells, write_report
@@ -53,6 +54,8 @@ def track(
     jobs: int | None,
 ) -> None:
     """Track every recording that has no tracks yet; write tracks, exports, overlays and a report.
+
+    Exports, overlays and report contain the corrections that lie beside the tracks.
 
     Args:
         videos: folder of videos, or one video.
@@ -100,7 +103,8 @@ def track(
             while not wait([future], SIGNAL_CHECK_S).done:
                 pass
             try:
-                done[name], was_there = future.result()
+                tracked, was_there = future.result()
+                done[name] = with_corrections(tracked, out / f"{name}.h5").tracks
             except InputError as error:
                 failed[name] = str(error)
                 continue

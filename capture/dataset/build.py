@@ -172,6 +172,8 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
             "fit_residual_mm": 1e3 * initial.residual,
             "fit_markers_mm": 1e3 * np.linalg.norm(residual, axis=1),
             "source": recording.source,
+            "corrections": recording.corrections,
+            "unfit_corrections": recording.unfit_corrections,
         },
     )
 

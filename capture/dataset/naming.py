@@ -99,12 +99,4 @@ def _ordered(recording: Recording, specimen: Specimen, name: str) -> Recording:
     order = [recording.names.index(marker) if marker in recording.names else -1 for marker in layout_names]
     position, sigma = recording.position[:, order].copy(), recording.sigma[:, order].copy()
     position[:, [layout_names.index(marker) for marker in missing]] = np.nan
-    return Recording(
-        layout_names,
-        recording.time,
-        position,
-        sigma,
-        recording.rest,
-        recording.in_specimen_frame,
-        recording.source,
-    )
+    return replace(recording, names=tuple(layout_names), position=position, sigma=sigma)

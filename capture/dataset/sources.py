@@ -15,8 +15,9 @@ from rafl.common.errors import InputError
 from rafl.common.files import sha256
 from rafl.common.names import require_names
 from rafl.common.units import METRES
+from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
+from rafl.tracking.reconstruction.corrections import corrections_path
 from rafl.tracking.reconstruction.gap_filling import MISSING
-from rafl.tracking.reconstruction.tracks import read_tracks
 
 Array = NDArray[Any]
 
@@ -56,7 +57,7 @@ def find_sources(folder: Path, recording: str) -> list[Path]:
 def read_recording(path: Path, fps: float, unit: str | None = None) -> Recording:
     """Read a tracks file, a C3D file, a table, or a q<i>.npy file of the paper's authors.
 
-    A marker of which a coordinate is missing is missing.
+    Tracks are read with the corrections beside them. A marker of which a coordinate is missing is missing.
 
     Args:
         path: of the file.
@@ -104,9 +105,16 @@ def _check(recording: Recording) -> None:
 def _read(path: Path, fps: float, unit: str | None) -> Recording:
     source = f"{path.name} {sha256(path)}"
     if path.suffix == ".h5":
-        tracks = read_tracks(path)
+        found = read_corrected_tracks(path)
+        tracks, corrections = found.tracks, ""
+        if found.corrections:
+            beside = corrections_path(path)
+            applied = len(found.corrections) - len(found.unfit)
+            corrections = f"{applied} of {beside.name} {sha256(beside)}"
         position = np.where((tracks.state == MISSING)[..., None], np.nan, tracks.position)
-        return Recording(tracks.names, tracks.time, position, tracks.sigma, None, True, source)
+        return Recording(
+            tracks.names, tracks.time, position, tracks.sigma, None, True, source, corrections, "; ".join(found.unfit)
+        )
     if path.suffix == ".c3d":
         return _read_c3d(path, source)
     return _read_npy(path, fps, source) if path.suffix == ".npy" else _read_table(path, fps, unit, source)

@@ -70,6 +70,8 @@ def warnings(dataset: Dataset) -> list[str]:
                 f"recording {name}: {outliers} too far from the position in the specimen's layout, left out; correct "
                 "at_mm, or the names in the tracks"
             )
+        if unfit := item.attributes.get("unfit_corrections"):
+            lines.append(f"recording {name}: {unfit}; correct it in rafl-review")
         start, not_free = (int(str(item.attributes.get(key, 0))) for key in ("first_frame", "not_free_frames"))
         if not_free:
             lines.append(
@@ -135,7 +137,8 @@ def print_contents(path: Path, console: Console) -> None:
         values = item.attributes
         line = (
             f"{name}: registered by {values.get('registration', '-')} ({values.get('registration_markers') or '-'}); "
-            f"first frame from {values.get('first_frame_from', '-')}; source {values.get('source', '-')}"
+            f"first frame from {values.get('first_frame_from', '-')}; source {values.get('source', '-')}; "
+            f"corrections {values.get('corrections') or '-'}"
         )
         console.print(Text(line))
     for line in warnings(dataset):

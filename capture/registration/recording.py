@@ -20,6 +20,8 @@ class Recording:
         rest: positions of the undeformed specimen in the same frame [m], (M, 3), if recorded.
         in_specimen_frame: whether a calibration has put the positions into the specimen frame.
         source: file name and SHA-256.
+        corrections: how many corrections by a person the positions contain, their file and its SHA-256.
+        unfit_corrections: those that do not fit the tracks and were left out.
     """
 
     names: tuple[str, ...] | None
@@ -29,3 +31,5 @@ class Recording:
     rest: Array | None
     in_specimen_frame: bool
     source: str
+    corrections: str = ""
+    unfit_corrections: str = ""

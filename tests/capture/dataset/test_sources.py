@@ -1,13 +1,18 @@
 """Recordings of strangers: arrays and times that make no recording are refused in one line."""
 
 import io
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
+from filmed import make_film, with_swapped
 
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.common.errors import InputError
+from rafl.common.files import sha256
+from rafl.tracking.reconstruction.corrections import Delete, Swap, corrections_path, write_corrections
+from rafl.tracking.reconstruction.tracks import write_tracks
 
 GOOD = np.random.default_rng(0).normal(0.0, 30.0, (6, 4, 3))  # [mm]
 
@@ -84,3 +89,17 @@ def test_recording_is_looked_for_in_its_folder_only(tmp_path: Path, recording: s
     (tmp_path / "tracks").mkdir()
     with pytest.raises(InputError, match="recording: expected a name"):
         find_sources(tmp_path / "tracks", recording)
+
+
+def test_tracks_are_read_with_their_corrections(tmp_path: Path) -> None:
+    film = make_film(tmp_path, frames=30)
+    write_tracks(film.path, with_swapped(film.tracks, "A1", "B1", 20))
+    who = {"by": "Ann", "at": datetime(2026, 1, 2, tzinfo=UTC), "camera": "left"}
+    beside = corrections_path(film.path)
+    write_corrections(beside, (Swap(**who, markers=("A1", "B1"), first=20), Delete(**who, marker="Z", first=1, last=2)))
+    found = read_recording(film.path, 100.0)
+    np.testing.assert_allclose(found.position, film.tracks.position, atol=1e-9)
+    assert found.corrections == f"1 of swing.corrections.yaml {sha256(beside)}"
+    assert "correction 2 (delete, by Ann) is left out: the tracks have no marker Z" in found.unfit_corrections
+    beside.unlink()
+    assert read_recording(film.path, 100.0).corrections == ""
