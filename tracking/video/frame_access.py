@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -124,6 +125,7 @@ class _SoughtFrames:
     def __init__(self, path: Path, index: _PacketIndex) -> None:
         self.path, self.index = path, index
         self.recent: deque[tuple[int, av.VideoFrame | Array]] = deque(maxlen=RECENT_FRAMES)
+        self.wanted = 0
         self.container = open_container(path)
         self._start_reading()
         is_jpeg = self.stream.codec_context.codec.name == "mjpeg"
@@ -134,7 +136,7 @@ class _SoughtFrames:
         self.stream = self.container.streams.video[0]
         self.decoder = FFmpegDecoder(self.stream)
         self.began = self.next_position = 0  # positions of the packet at which reading began, and of the next one
-        self.packets = read_packets(self.container, self.stream, [])
+        self.decoded = self._decode(read_packets(self.container, self.stream, []))
 
     def _restart(self) -> None:
         self.close()
@@ -161,7 +163,8 @@ class _SoughtFrames:
         self.container.close()
 
     def _read_to(self, number: int) -> Array | None:
-        for found, frame in self._decode(number):
+        self.wanted = number
+        for found, frame in self.decoded:
             self.recent.append((found, frame))
             if found == number:
                 return self._grey(frame)
@@ -196,16 +199,16 @@ class _SoughtFrames:
             position = self.index.position.get(first.pts) if first.pts is not None else None
             if position is not None and position <= key:
                 self.began = self.next_position = position
-                self.packets = _with_first(first, packets)
+                self.decoded = self._decode(chain([first], packets))
                 return
         self._restart()
 
-    def _decode(self, number: int) -> Iterator[tuple[int, "av.VideoFrame | Array"]]:
-        """Decode on from the next packet. Frames well before `number` that no other refers to are left out."""
-        for packet in self.packets:
+    def _decode(self, packets: Iterator["av.packet.Packet"]) -> Iterator[tuple[int, "av.VideoFrame | Array"]]:
+        """Frames with their numbers. Those well before the wanted one that no other refers to are left out."""
+        for packet in packets:
             if packet.pts is not None:
                 self.next_position = self.index.position.get(packet.pts, self.next_position) + 1
-                well_before = self.index.number.get(packet.pts, number) < number - RECENT_FRAMES
+                well_before = self.index.number.get(packet.pts, self.wanted) < self.wanted - RECENT_FRAMES
                 self.decoder.context.skip_frame = "NONREF" if well_before else "DEFAULT"
             if self.jpeg is not None:
                 image = self.jpeg.decode_image(packet) if packet.size and not packet.is_corrupt else None
@@ -216,8 +219,3 @@ class _SoughtFrames:
                 found = self.index.number.get(frame.pts)
                 if found is not None:
                     yield found, frame
-
-
-def _with_first(first: "av.packet.Packet", packets: Iterator["av.packet.Packet"]) -> Iterator["av.packet.Packet"]:
-    yield first
-    yield from packets

@@ -13,7 +13,7 @@ from support import ramp_frame, write_video
 from rafl.tracking.video.frame_access import open_frames
 from rafl.tracking.video.reader import open_video
 
-ORDER = [0, 1, 39, 38, 20, 21, 22, 5, 30, 29, 28, 27, 0, 40, 17, -1]
+ORDER = [0, 1, 36, 37, 38, 39, 38, 20, 21, 22, 5, 30, 29, 28, 27, 0, 40, 17, -1]
 
 
 def noisy_frames(count: int = 40) -> list[np.ndarray]:

@@ -1,0 +1,57 @@
+"""What `rafl-review` does once its options are checked: serve the page on this machine until Ctrl-C."""
+
+import secrets
+import socket
+import webbrowser
+from pathlib import Path
+
+import typer
+import uvicorn
+
+from rafl.common.command_line import one_line
+from rafl.common.errors import InputError
+from rafl.common.interruption import Terminated
+from rafl.common.kernels import announce_compilation
+from rafl.review.recordings import Library
+from rafl.review.server import create_server
+
+HOST = "127.0.0.1"
+SHUTDOWN_S = 2  # for requests that are being answered when the command is stopped
+
+
+def serve(tracks: Path, videos: Path | None, who: str, port: int, browser: bool) -> None:
+    """Serve the page until Ctrl-C.
+
+    Args:
+        tracks: folder of tracks.
+        videos: folder of videos; None where `rafl-track` found them.
+        who: name for the corrections.
+        port: on the loopback interface; 0 for a free one.
+        browser: whether to open the page.
+
+    Raises:
+        InputError: there are no tracks, or the port is taken.
+    """
+    library = Library(tracks, videos, who)
+    if not library.names():
+        raise InputError(f"expected tracks (.h5) in {tracks}, found none; track the videos with rafl-track")
+    announce_compilation()
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind((HOST, port))
+        except OSError as error:
+            raise InputError(f"--port: expected a free port, found {port}: {error.strerror}; choose another") from None
+        port = listener.getsockname()[1]
+        token = secrets.token_urlsafe(24)
+        address = f"http://{HOST}:{port}/?token={token}"
+        typer.echo(f"{len(library.names())} recordings in {one_line(str(tracks))}; Ctrl-C ends")
+        typer.echo(f"open {address}")
+        app = create_server(library, token, port, (lambda: webbrowser.open(address)) if browser else None)
+        config = uvicorn.Config(app, log_level="error", access_log=False, timeout_graceful_shutdown=SHUTDOWN_S)
+        try:
+            uvicorn.Server(config).run(sockets=[listener])
+        except KeyboardInterrupt as error:
+            if isinstance(error, Terminated):
+                raise
+            typer.echo("stopped; all corrections are written")

@@ -1,0 +1,165 @@
+"""One open recording: its tracks, its corrections, its frames, and who may correct it."""
+
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rafl.common.errors import InputError
+from rafl.review.frames import FrameStore
+from rafl.tracking.reconstruction.corrected_tracks import apply_corrections
+from rafl.tracking.reconstruction.corrections import (
+    Correction,
+    corrections_path,
+    corrections_text,
+    read_corrections,
+    write_corrections,
+)
+from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
+from rafl.tracking.video.reader import Video
+
+Array = NDArray[Any]
+
+# Pages say every few seconds that they are there; browsers let pages in the background do so once a minute.
+CLAIM_S = 70.0
+
+FindVideo = Callable[[str, str, Tracks], Video]
+
+
+class ReadOnlyError(Exception):
+    """Another page has the recording."""
+
+
+class OpenRecording:
+    """A recording in memory.
+
+    Attributes:
+        raw: the tracks as tracked.
+        found: the tracks with the corrections.
+        revision: number of changes since the recording was opened.
+        editing: lock that whoever changes corrections holds.
+    """
+
+    def __init__(self, path: Path, who: str, find_video: FindVideo) -> None:
+        self.path, self.who, self.find_video = path, who, find_video
+        self.stamp = path.stat().st_mtime_ns
+        self.raw = read_tracks(path)
+        self.beside = corrections_path(path)
+        self.corrections = read_corrections(self.beside)
+        self.text = self.beside.read_bytes() if self.beside.exists() else None
+        self.found = apply_corrections(self.raw, self.corrections, path)
+        self.undone: list[tuple[Correction, ...]] = []
+        self.revision = 0
+        self.editing = threading.RLock()
+        self.stores: dict[str, FrameStore] = {}
+        self.opening = threading.Lock()
+        self.claim: tuple[str, float] = ("", -np.inf)
+
+    @property
+    def tracks(self) -> Tracks:
+        """The tracks with the corrections."""
+        return self.found.tracks
+
+    def is_changed(self) -> bool:
+        """Whether another program has changed the files."""
+        with self.editing:
+            on_disk = self.beside.read_bytes() if self.beside.exists() else None
+            return not self.path.exists() or self.path.stat().st_mtime_ns != self.stamp or on_disk != self.text
+
+    def frames(self, camera: str) -> FrameStore:
+        """The frames of a camera.
+
+        Raises:
+            InputError: there is no such camera, or its video is not there or another one.
+        """
+        with self.opening:
+            if camera not in self.stores:
+                if camera not in self.raw.pixel:
+                    raise InputError(f"expected a camera of the tracks, found {camera!r:.80}; load the page again")
+                self.stores[camera] = FrameStore(self.find_video(self.path.stem, camera, self.raw))
+            return self.stores[camera]
+
+    def close(self) -> None:
+        """Close the videos."""
+        with self.opening:
+            for store in self.stores.values():
+                store.close()
+            self.stores.clear()
+
+    def claim_for(self, page: str) -> bool:
+        """Whether a page may correct the recording: the first that asked, until it leaves."""
+        with self.editing:
+            holder, since = self.claim
+            if page == holder or time.monotonic() - since > CLAIM_S:
+                self.claim = (page, time.monotonic())
+            return self.claim[0] == page
+
+    def release(self, page: str) -> None:
+        """A page leaves."""
+        with self.editing:
+            if self.claim[0] == page:
+                self.claim = ("", -np.inf)
+
+    def require_claim(self, page: str) -> None:
+        """Raise `ReadOnlyError` unless a page may correct the recording."""
+        if not self.claim_for(page):
+            raise ReadOnlyError("another page has this recording open; close it there to correct it here")
+
+    def next_moment(self) -> datetime:
+        """The time of a new correction, later than all others: corrections of one time are undone together."""
+        now = datetime.now(UTC)
+        now = now.replace(microsecond=now.microsecond // 1000 * 1000)
+        latest = max((entry.at for entry in self.corrections), default=now - timedelta(days=1))
+        return now if now > latest else latest + timedelta(milliseconds=1)
+
+    def add(self, entries: tuple[Correction, ...]) -> None:
+        """Add corrections.
+
+        Raises:
+            InputError: they do not fit the tracks, or cannot be written.
+        """
+        self._replace((*self.corrections, *entries), len(entries))
+        self.undone.clear()
+
+    def replace_last(self, entry: Correction) -> None:
+        """Replace the last correction by one that goes on from it."""
+        self._replace((*self.corrections[:-1], entry), 1)
+
+    def undo(self) -> bool:
+        """Take back the last correction, and those made together with it; False if there is none."""
+        if not self.corrections:
+            return False
+        moment = self.corrections[-1].at
+        first = next(number for number, entry in enumerate(self.corrections) if entry.at == moment)
+        taken = self.corrections[first:]
+        self._replace(self.corrections[:first], 0)
+        self.undone.append(taken)
+        return True
+
+    def redo(self) -> bool:
+        """Make the correction again that was taken back last; False if there is none."""
+        if not self.undone:
+            return False
+        entries = self.undone[-1]
+        self._replace((*self.corrections, *entries), len(entries))
+        self.undone.pop()
+        return True
+
+    def _replace(self, corrections: tuple[Correction, ...], new: int) -> None:
+        """Write the corrections, of which the last `new` must fit the tracks, and apply them."""
+        on_disk = self.beside.read_bytes() if self.beside.exists() else None
+        if on_disk != self.text:
+            raise InputError(f"{self.beside.name} was changed by another program; load the page again")
+        found = apply_corrections(self.raw, corrections, self.path)
+        rejected = [line for line in found.unfit if line not in self.found.unfit]
+        if new and rejected:
+            raise InputError(rejected[-1].partition(": ")[2])
+        write_corrections(self.beside, corrections)
+        self.text = corrections_text(corrections).encode()
+        self.corrections, self.found = corrections, found
+        self.revision += 1

@@ -1,0 +1,45 @@
+// The lists beside the frames: stretches to look at, corrections, notes.
+
+const $ = (selector) => document.querySelector(selector);
+
+function item(text, className = "") {
+  const entry = document.createElement("li");
+  entry.textContent = text;
+  entry.className = className;
+  return entry;
+}
+
+const SIZES = { jump: "px jump", residual: "px residual", sigma: "px sigma", missing: "frames missing", filled: "frames filled" };
+
+export function showStretches(stretches, names, current, choose) {
+  $("#count").textContent = stretches.length;
+  $("#stretches").replaceChildren(...stretches.map((stretch, index) => {
+    const size = stretch.kind === "missing" || stretch.kind === "filled" ? stretch.size : stretch.size.toFixed(stretch.size < 10 ? 2 : 0);
+    const where = stretch.first === stretch.last ? `${stretch.first}` : `${stretch.first} to ${stretch.last}`;
+    const text = `${names[stretch.marker]}: ${size} ${SIZES[stretch.kind]}, ${where}${stretch.camera ? `, ${stretch.camera}` : ""}`;
+    const entry = item(text, `${index === current ? "current" : ""} ${stretch.reviewed ? "reviewed" : ""}`);
+    entry.addEventListener("click", () => choose(index));
+    return entry;
+  }));
+  $("#stretches .current")?.scrollIntoView({ block: "nearest" });
+}
+
+function described(entry) {
+  const texts = {
+    place: () => `${entry.marker} ${{ fit: "fitted", hand: "set by hand", followed: "followed" }[entry.how]}, ${entry.frames} frame${entry.frames === 1 ? "" : "s"}`,
+    delete: () => `${entry.marker} deleted, ${entry.first} to ${entry.last}`,
+    accept: () => `${entry.marker} accepted, ${entry.first} to ${entry.last}`,
+    swap: () => `${entry.markers.join(" and ")} swapped from ${entry.first} on`,
+    rename: () => `${entry.marker} is now ${entry.to}`,
+  };
+  return `${texts[entry.kind]()}, ${entry.camera} - ${entry.by}, ${entry.at.slice(0, 16).replace("T", " ")}`;
+}
+
+export function showCorrections({ corrections, corrections_file: file }) {
+  $("#file").textContent = corrections.length ? `in ${file}, the last first:` : `none yet; they go to ${file}`;
+  $("#corrections").replaceChildren(...corrections.map((entry) => item(described(entry))).reverse());
+}
+
+export function showNotes(notes) {
+  $("#notes").replaceChildren(...notes.map((note) => item(note)));
+}

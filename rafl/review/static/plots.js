@@ -1,0 +1,74 @@
+// Plots of the selected marker over time, with a line at the frame shown. A click jumps there.
+
+import uPlot from "/static/uPlot.esm.js";
+import { getArray } from "/static/api.js";
+
+const AXIS = { stroke: "#9aa4af", grid: { stroke: "#2c3137" }, ticks: { stroke: "#3a3f46" }, font: "11px system-ui" };
+const PLOTS = [
+  { key: "path", share: 0.46, label: "path", series: [["x [mm]", "#ff8f6b"], ["y [mm]", "#5aff7a"], ["z [mm]", "#6bb8ff"], ["u [px]", "#d5a6ff"], ["v [px]", "#ffe36b"]] },
+  { key: "residual", share: 0.27, label: "residual", series: [["residual [px]", "#ff8f6b"]] },
+  { key: "sigma", share: 0.27, label: "sigma", series: [["sigma [px]", "#6bb8ff"], ["sigma [mm]", "#5aff7a"]] },
+];
+const BANDS = { 0: "#ff5a4a33", 2: "#ffaa2833" }; // missing, filled
+
+export class Plots {
+  constructor(parent, rows, jump) {
+    Object.assign(this, { parent, rows, jump, row: 0, state: null, plots: [] });
+    this.x = Float64Array.from({ length: rows }, (_, row) => row);
+    for (const { key, series } of PLOTS) {
+      const options = {
+        ...this.size(key), scales: { x: { time: false } }, cursor: { drag: { x: true, y: false }, sync: { key: "row" } },
+        axes: [{ ...AXIS, size: 26 }, { ...AXIS, size: 52 }, ...(key === "residual" ? [] : [{ ...AXIS, size: 52, side: 1, scale: "second", grid: { show: false } }])],
+        series: [{ label: "row" }, ...series.map(([label, stroke]) => ({ label, stroke, width: 1.2, spanGaps: false, scale: this.scaleOf(key, label), value: (_, v) => (v == null ? "-" : v.toFixed(3)) }))],
+        hooks: { drawClear: [(plot) => this.drawBands(plot)], draw: [(plot) => this.drawLine(plot)] },
+      };
+      const plot = new uPlot(options, [this.x, ...series.map(() => new Array(rows).fill(null))], parent);
+      plot.root.dataset.plot = key;
+      plot.over.addEventListener("click", () => { if (plot.select.width < 3) this.jump(Math.round(plot.posToVal(plot.cursor.left, "x"))); });
+      this.plots.push(plot);
+    }
+    new ResizeObserver(() => this.plots.forEach((plot, k) => plot.setSize(this.size(PLOTS[k].key)))).observe(parent);
+  }
+
+  scaleOf(key, label) { return (key === "path" && label.endsWith("[px]")) || (key === "sigma" && label.endsWith("[mm]")) ? "second" : "y"; }
+
+  size(key) {
+    const { share } = PLOTS.find((plot) => plot.key === key);
+    return { width: Math.max(this.parent.clientWidth, 200), height: Math.max(Math.round(share * this.parent.clientHeight) - 26, 50) };
+  }
+
+  async load(name, marker, camera) {
+    const values = await getArray("series", { name, marker, camera });
+    const column = (k) => Array.from(values.subarray(k * this.rows, (k + 1) * this.rows), (v) => (Number.isFinite(v) ? v : null));
+    const [x, y, z, sigmaMm, u, v, sigmaPx, residual, state] = Array.from({ length: 9 }, (_, k) => column(k));
+    this.state = state;
+    [[x, y, z, u, v], [residual], [sigmaPx, sigmaMm]].forEach((data, k) => this.plots[k].setData([this.x, ...data]));
+  }
+
+  show(row) {
+    this.row = row;
+    for (const plot of this.plots) plot.redraw(false, false);
+  }
+
+  drawBands(plot) {
+    if (!this.state) return;
+    const { left, top, width, height } = plot.bbox;
+    for (let row = 0; row < this.rows;) {
+      let end = row + 1;
+      while (end < this.rows && this.state[end] === this.state[row]) end++;
+      if (BANDS[this.state[row]]) {
+        const from = Math.max(plot.valToPos(row - 0.5, "x", true), left), to = Math.min(plot.valToPos(end - 0.5, "x", true), left + width);
+        plot.ctx.fillStyle = BANDS[this.state[row]];
+        if (to > from) plot.ctx.fillRect(from, top, Math.max(to - from, 1), height);
+      }
+      row = end;
+    }
+  }
+
+  drawLine(plot) {
+    const { top, height, left, width } = plot.bbox, x = plot.valToPos(this.row, "x", true);
+    if (x < left || x > left + width) return;
+    plot.ctx.fillStyle = "#fffc";
+    plot.ctx.fillRect(x - 0.5, top, 1.5, height);
+  }
+}

@@ -1,0 +1,306 @@
+// One recording: frames with markers, plots, stretches to look at, and corrections.
+
+import { Images, Rows, get, leave, page, post } from "/static/api.js";
+import { Plots } from "/static/plots.js";
+import { showCorrections, showNotes, showStretches } from "/static/panels.js";
+import { CameraView } from "/static/view.js";
+
+const CLAIM_MS = 3000;
+const PREFETCHED = 4; // frames ahead of the one shown
+const $ = (selector) => document.querySelector(selector);
+
+export class Recording {
+  constructor(name) {
+    Object.assign(this, { name, row: 0, selected: [], camera: "", stretches: [], current: -1, writable: false, adding: false, stopped: false, wanted: 0, busy: Promise.resolve() });
+    this.listening = new AbortController();
+  }
+
+  async start() {
+    $("#title").textContent = this.name;
+    $("#warning").hidden = true;
+    $("#message").textContent = "";
+    document.title = `${this.name} - rafl-review`;
+    this.state = await get("recording", { name: this.name });
+    const cameras = this.state.cameras.map(({ name }) => name);
+    this.camera = cameras[0] ?? "";
+    this.data = new Rows(this.name, cameras, this.state.rows);
+    this.data.reset(this.state.names.length);
+    this.images = new Images(this.name);
+    $("#cameras").replaceChildren();
+    $("#plots").replaceChildren();
+    const calls = {
+      select: (marker, more) => this.select(marker, more),
+      move: (camera, marker, x, y, hand) => this.act({ kind: "place", camera, marker: this.state.names[marker], x, y, hand, sigma: Number($("#sigma").value) || 1 }),
+      click: (camera, x, y) => this.adding && (this.add(camera, x, y), true),
+      activate: (camera) => this.activate(camera),
+    };
+    this.views = this.state.cameras.map(({ name, size }) => new CameraView($("#cameras"), name, size, calls));
+    this.activate(this.camera);
+    this.plots = new Plots($("#plots"), this.state.rows, (row) => this.show(row));
+    this.listen();
+    this.showState();
+    await this.claim();
+    this.claiming = setInterval(() => this.claim(), CLAIM_MS);
+    await Promise.all([this.show(0), this.loadStretches(), cameras.length ? this.plotMarker() : undefined]);
+    document.body.dataset.ready = "recording";
+  }
+
+  close() {
+    this.stopped = true;
+    this.playing = false;
+    clearInterval(this.claiming);
+    this.listening.abort();
+    leave(this.name);
+  }
+
+  async claim() {
+    try {
+      const { writable, revision } = await post("claim", { name: this.name, page });
+      this.writable = writable;
+      if (revision !== this.state.revision && !this.acting) await this.reload();
+    } catch (error) {
+      this.writable = false;
+      this.warning = `the server does not answer: ${error.message}`;
+      this.showWarning();
+      return;
+    }
+    this.warning = "";
+    this.showWarning();
+  }
+
+  showWarning() {
+    const reasons = [this.warning];
+    if (!this.writable && !this.warning) reasons.push("Another page has this recording open: it can be looked at here, and corrected once that page is closed.");
+    if (!this.state.has_calibration) reasons.push("The tracks hold no cameras, so nothing can be corrected; track again.");
+    reasons.push(...this.state.unfit);
+    const text = reasons.filter(Boolean).join(" ");
+    $("#warning").textContent = text;
+    $("#warning").hidden = !text;
+    document.body.dataset.writable = String(this.writable);
+    for (const button of document.querySelectorAll("[data-do]:not([data-do=earlier]):not([data-do=later]), #undo, #redo")) button.disabled = !this.writable;
+    if (this.writable) {
+      $("#undo").disabled = !this.state.corrections.length;
+      $("#redo").disabled = !this.state.redo;
+    }
+  }
+
+  // Show a row: all cameras at once, when their frames are there. The last row asked for wins.
+  async show(row) {
+    row = Math.min(Math.max(Math.round(row), 0), this.state.rows - 1);
+    const ticket = ++this.wanted;
+    await this.data.load(row);
+    const found = this.data.at(row);
+    if (!found || ticket !== this.wanted) return;
+    const numbers = this.views.map((view) => found.block.cameras[view.camera].frame[found.at]);
+    const images = await Promise.all(this.views.map((view, k) => (numbers[k] < 0 ? null : this.images.get(view.camera, numbers[k]))));
+    if (ticket !== this.wanted || this.stopped) return;
+    this.row = row;
+    this.views.forEach((view, k) => view.show(images[k], this.data, row, this.state.names, this.selected));
+    this.plots.show(row);
+    $("#row").value = row;
+    $("#time").textContent = `${found.block.time[found.at].toFixed(3)} s`;
+    document.body.dataset.row = row;
+    this.views.forEach((view, k) => {
+      for (let ahead = 1; ahead <= PREFETCHED && numbers[k] >= 0 && row + ahead < this.state.rows; ahead++) this.images.get(view.camera, numbers[k] + ahead);
+    });
+  }
+
+  redraw() { for (const view of this.views) { view.selected = this.selected; view.draw(); } }
+
+  activate(camera) {
+    if (camera !== this.camera && this.plots) { this.camera = camera; this.plotMarker(); }
+    this.camera = camera;
+    for (const view of this.views) view.box.classList.toggle("active", view.camera === camera);
+  }
+
+  select(marker, more) {
+    if (marker < 0) this.selected = more ? this.selected : [];
+    else if (more) this.selected = [...this.selected.filter((other) => other !== marker), marker].slice(-2);
+    else this.selected = [marker];
+    $("#selected").textContent = this.selected.map((index) => this.state.names[index]).join(" and ");
+    document.body.dataset.selected = this.selected.map((index) => this.state.names[index]).join(",");
+    this.redraw();
+    this.plotMarker();
+  }
+
+  plotMarker() { return this.plots.load(this.name, this.selected.at(-1) ?? 0, this.camera).catch((error) => this.say(error.message, true)); }
+
+  say(text, bad = false) {
+    $("#message").textContent = text;
+    $("#message").classList.toggle("bad", bad);
+  }
+
+  // Do what the server calls an action, one after the other, and show what it changed.
+  act(action) {
+    this.busy = this.busy.then(() => this.perform(action));
+    return this.busy;
+  }
+
+  async perform(action) {
+    if (!this.writable) return this.say("Another page has this recording; it cannot be corrected here.", true);
+    document.body.dataset.acting = "yes";
+    this.acting = true;
+    try {
+      const answer = await post("correct", { name: this.name, page }, { row: this.row, ...action });
+      this.say(answer.message);
+      await this.take(answer);
+      return answer;
+    } catch (error) {
+      this.say(error.message, true);
+    } finally {
+      this.acting = false;
+      delete document.body.dataset.acting;
+    }
+  }
+
+  async reload() { await this.take(await get("recording", { name: this.name })); }
+
+  async take(state) {
+    Object.assign(this.state, state);
+    this.data.reset(this.state.names.length);
+    this.selected = this.selected.filter((marker) => marker < this.state.names.length);
+    this.showState();
+    await this.show(this.row);
+    document.body.dataset.revision = this.state.revision;
+    this.plotMarker();
+    this.loadStretches();
+  }
+
+  showState() {
+    showCorrections(this.state);
+    showNotes(this.state.notes);
+    this.showWarning();
+    $("#names").replaceChildren(...this.state.names.map((name) => Object.assign(document.createElement("option"), { value: name })));
+  }
+
+  async loadStretches() {
+    const revision = this.state.revision;
+    const found = await get("stretches", { name: this.name });
+    if (revision !== this.state.revision) return;
+    this.stretches = found.filter((item) => !item.reviewed || $("#all").checked);
+    const before = this.chosen;
+    this.current = before ? this.stretches.findIndex((item) => item.kind === before.kind && item.marker === before.marker && item.camera === before.camera && item.first === before.first) : -1;
+    if (this.current < 0 && before) this.current = Math.min(this.position, this.stretches.length) - 0.5; // between two: it is gone
+    this.listStretches();
+  }
+
+  listStretches() { showStretches(this.stretches, this.state.names, this.current, (index) => this.goTo(index)); }
+
+  goTo(index) {
+    if (!this.stretches.length) return this.say("Nothing is left to look at.");
+    index = Math.min(Math.max(index, 0), this.stretches.length - 1);
+    const item = this.stretches[index];
+    this.current = this.position = index;
+    this.chosen = item;
+    this.listStretches();
+    $("#from").value = item.first;
+    $("#to").value = item.last;
+    if (item.camera) this.activate(item.camera);
+    this.select(item.marker, false);
+    this.show(item.first);
+  }
+
+  stretch() {
+    const first = $("#from").value === "" ? this.row : Number($("#from").value);
+    const last = $("#to").value === "" ? first : Number($("#to").value);
+    return { row: Math.min(first, last), last_row: Math.max(first, last) };
+  }
+
+  marker() {
+    if (!this.selected.length) throw new Error("Click on a marker first.");
+    return this.state.names[this.selected.at(-1)];
+  }
+
+  async do(what) {
+    try {
+      const camera = this.camera;
+      if (what === "later") this.goTo(Math.floor(this.current) + 1);
+      else if (what === "earlier") this.goTo(Math.ceil(this.current) - 1);
+      else if (what === "swap") {
+        if (this.selected.length !== 2) throw new Error("Click on a marker, and with Shift on a second one, to swap them.");
+        const [marker, other] = this.selected.map((index) => this.state.names[index]);
+        await this.act({ kind: "swap", camera, marker, other });
+      } else if (what === "delete") await this.act({ kind: "delete", camera, marker: this.marker(), ...this.stretch(), all_cameras: $("#everywhere").checked });
+      else if (what === "accept") {
+        await this.act({ kind: "accept", camera, marker: this.marker(), ...this.stretch() });
+      } else if (what === "rename") {
+        if (!$("#name").value) throw new Error("Type the new name first.");
+        await this.act({ kind: "rename", camera, marker: this.marker(), other: $("#name").value });
+      } else if (what === "follow") await this.follow(camera, this.marker());
+      else if (what === "add") {
+        const name = $("#name").value || this.marker();
+        this.adding = name;
+        this.say(`Click on the dot of ${name}.`);
+      } else await this.act({ kind: what });
+    } catch (error) {
+      this.say(error.message, true);
+    }
+  }
+
+  async add(camera, x, y) {
+    const marker = this.adding;
+    this.adding = false;
+    const isNew = !this.state.names.includes(marker);
+    const answer = await this.act({ kind: "place", camera, marker, x, y, new: isNew });
+    if (!answer) return;
+    this.select(this.state.names.indexOf(marker), false);
+    await this.follow(camera, marker);
+  }
+
+  async follow(camera, marker) {
+    const first = this.row;
+    this.following = true;
+    for (let row = first; this.following;) {
+      const answer = await this.act({ kind: "follow", camera, marker, row });
+      if (!answer?.more) break;
+      row = answer.row;
+    }
+    this.following = false;
+  }
+
+  async play() {
+    this.playing = !this.playing;
+    $("#play").textContent = this.playing ? "Stop" : "Play";
+    while (this.playing && this.row < this.state.rows - 1) {
+      const due = performance.now() + 1000 / Math.min(this.state.fps, 50);
+      await this.show(this.row + 1);
+      await new Promise((done) => setTimeout(done, Math.max(due - performance.now(), 0)));
+    }
+    this.playing = false;
+    $("#play").textContent = "Play";
+  }
+
+  listen() {
+    const on = (target, kind, call) => target.addEventListener(kind, call, { signal: this.listening.signal });
+    for (const button of document.querySelectorAll("[data-do]")) on(button, "click", () => { button.blur(); this.do(button.dataset.do); });
+    on($("#previous"), "click", () => this.show(this.row - 1));
+    on($("#next"), "click", () => this.show(this.row + 1));
+    on($("#play"), "click", () => { $("#play").blur(); this.play(); });
+    on($("#undo"), "click", () => this.do("undo"));
+    on($("#redo"), "click", () => this.do("redo"));
+    on($("#help"), "click", () => $("#keys").showModal());
+    on($("#row"), "change", () => this.show(Number($("#row").value)));
+    on($("#all"), "change", () => this.loadStretches());
+    on(window, "keydown", (event) => this.onKey(event));
+  }
+
+  onKey(event) {
+    if (event.target.matches("input, dialog *") || event.altKey || event.metaKey) return;
+    const step = event.shiftKey ? 10 : 1;
+    const keys = {
+      ArrowLeft: () => this.show(this.row - step), ArrowRight: () => this.show(this.row + step),
+      Home: () => this.show(0), End: () => this.show(this.state.rows - 1), " ": () => this.play(),
+      n: () => this.do("later"), p: () => this.do("earlier"), s: () => this.do("swap"), d: () => this.do("delete"),
+      f: () => this.do("follow"), a: () => this.do("add"), Enter: () => this.do("accept"),
+      "[": () => { $("#from").value = this.row; }, "]": () => { $("#to").value = this.row; },
+      0: () => this.views.forEach((view) => view.whole()),
+      e: () => { for (const view of this.views) view.ellipse = (view.ellipse + 1) % 3; this.redraw(); },
+      "?": () => $("#keys").showModal(), Escape: () => { this.adding = this.following = false; this.say(""); },
+    };
+    const withControl = { z: () => this.do("undo"), y: () => this.do("redo") };
+    const call = event.ctrlKey ? withControl[event.key] : keys[event.key];
+    if (!call) return;
+    event.preventDefault();
+    call();
+  }
+}

@@ -1,0 +1,97 @@
+"""Tracked films, and the server on them."""
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from filmed import Film, make_film, with_swapped
+from starlette.testclient import TestClient
+
+from rafl.review.recordings import Library
+from rafl.review.server import create_server
+from rafl.tracking.reconstruction.tracks import write_tracks
+
+PORT, TOKEN = 4321, "token-of-the-tests"
+
+
+@pytest.fixture(scope="session")
+def filmed(tmp_path_factory: pytest.TempPathFactory) -> Film:
+    """A film in which the left camera loses the marker B3 for 8 frames, as tracked."""
+    folder = tmp_path_factory.mktemp("filmed")
+    return make_film(folder, frames=80, hidden={frame: (7,) for frame in range(20, 28)})
+
+
+@pytest.fixture
+def film(filmed: Film, tmp_path: Path) -> Film:
+    """A copy whose tracks take A1 and B1 for each other in the left camera from row 40 on."""
+    shutil.copytree(filmed.folder, tmp_path / "lab")
+    copy = Film(tmp_path / "lab", filmed.name, filmed.tracks)
+    videos = {name: str(copy.folder / f"videos/swing/{name}.mp4") for name in filmed.tracks.videos}
+    swapped = with_swapped(filmed.tracks, "A1", "B1", 40)
+    swapped.videos.update(videos)
+    write_tracks(copy.path, swapped)
+    return copy
+
+
+@pytest.fixture
+def client(film: Film) -> Iterator[TestClient]:
+    """A browser that has opened the address of a server on the film."""
+    app = create_server(Library(film.path.parent, None, "Ann"), TOKEN, PORT)
+    with TestClient(app, base_url=f"http://127.0.0.1:{PORT}") as found:
+        assert found.get(f"/?token={TOKEN}").status_code == 200
+        yield found
+
+
+@dataclass
+class Served:
+    """A running `rafl-review`.
+
+    Attributes:
+        process: of the command.
+        address: that it printed.
+    """
+
+    process: subprocess.Popen[str]
+    address: str
+
+    def kill(self) -> None:
+        """End it without a warning."""
+        self.process.kill()
+        self.process.wait()
+
+    def stop(self) -> int:
+        """End it as Ctrl-C does; returns the exit code."""
+        self.process.send_signal(signal.SIGINT)
+        return self.process.wait(20)
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Served]]:
+    """Start `rafl-review` on a folder of tracks."""
+    running = []
+
+    def start(folder: Path, *options: str) -> Served:
+        program = "from rafl.review.cli import review_app; review_app()"
+        line = [sys.executable, "-c", program, str(folder), "--no-browser", "--name", "Ann", *options]
+        environment = os.environ | {"PYTHONUNBUFFERED": "1"}
+        process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
+        running.append(process)
+        assert process.stdout is not None
+        text = ""
+        for out in process.stdout:
+            text += out
+            if match := re.search(r"open (http://\S+)", text):
+                return Served(process, match[1])
+        raise AssertionError(text)
+
+    yield start
+    for process in running:
+        process.kill()
+        process.wait()
