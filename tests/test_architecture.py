@@ -16,7 +16,7 @@ INSIDE = {
         "cli",
         "commands|calibration_commands",
         "rest|report|pipeline",
-        "overlay",
+        "overlay|single_marker",
         "linking",
         "video",
         "detection",

@@ -18,7 +18,7 @@ from rafl.review.recordings import Library
 from rafl.review.security import Guard
 from rafl.review.stretches import find_stretches
 
-TYPES = {".html": "text/html; charset=utf-8", ".js": "text/javascript", ".css": "text/css"}
+TYPES = {".svg": "image/svg+xml", ".html": "text/html; charset=utf-8", ".js": "text/javascript", ".css": "text/css"}
 MAX_SUMMARIES = 50  # of one call
 NO_VIDEO = 404
 

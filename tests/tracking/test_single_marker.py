@@ -8,7 +8,7 @@ import pytest
 from filmed import NAMES, RIG, frame_image, positions
 from support import SHARED, draw_frame
 
-from rafl.tracking.linking.single_marker import dot_at, follow_on
+from rafl.tracking.single_marker import dot_at, follow_on
 
 LEFT = RIG.cameras["left"]
 PATH = np.array([LEFT.project(positions(frame)) for frame in range(50)])
