@@ -40,6 +40,7 @@ def serve(tracks: Path, videos: Path | None, who: str, port: int, browser: bool)
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((HOST, port))
+            listener.listen()
         except OSError as error:
             raise InputError(f"--port: expected a free port, found {port}: {error.strerror}; choose another") from None
         port = listener.getsockname()[1]

@@ -3,15 +3,14 @@
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from filmed import Film, make_film, with_swapped
+from served import Served
 from starlette.testclient import TestClient
 
 from rafl.review.recordings import Library
@@ -47,29 +46,6 @@ def client(film: Film) -> Iterator[TestClient]:
     with TestClient(app, base_url=f"http://127.0.0.1:{PORT}") as found:
         assert found.get(f"/?token={TOKEN}").status_code == 200
         yield found
-
-
-@dataclass
-class Served:
-    """A running `rafl-review`.
-
-    Attributes:
-        process: of the command.
-        address: that it printed.
-    """
-
-    process: subprocess.Popen[str]
-    address: str
-
-    def kill(self) -> None:
-        """End it without a warning."""
-        self.process.kill()
-        self.process.wait()
-
-    def stop(self) -> int:
-        """End it as Ctrl-C does; returns the exit code."""
-        self.process.send_signal(signal.SIGINT)
-        return self.process.wait(20)
 
 
 @pytest.fixture

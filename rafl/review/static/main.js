@@ -15,7 +15,7 @@ async function route() {
   try {
     if (!match) await showList();
     else {
-      open = new Recording(decodeURIComponent(match[1]));
+      open = window.review = new Recording(decodeURIComponent(match[1]));
       await open.start();
     }
   } catch (error) {

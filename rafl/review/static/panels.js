@@ -16,7 +16,8 @@ export function showStretches(stretches, names, current, choose) {
   $("#stretches").replaceChildren(...stretches.map((stretch, index) => {
     const size = stretch.kind === "missing" || stretch.kind === "filled" ? stretch.size : stretch.size.toFixed(stretch.size < 10 ? 2 : 0);
     const where = stretch.first === stretch.last ? `${stretch.first}` : `${stretch.first} to ${stretch.last}`;
-    const text = `${names[stretch.marker]}: ${size} ${SIZES[stretch.kind]}, ${where}${stretch.camera ? `, ${stretch.camera}` : ""}`;
+    const who = stretch.other < 0 ? names[stretch.marker] : `${names[stretch.marker]} and ${names[stretch.other]} exchanged?`;
+    const text = `${who}: ${size} ${SIZES[stretch.kind]}, ${where}${stretch.camera ? `, ${stretch.camera}` : ""}`;
     const entry = item(text, `${index === current ? "current" : ""} ${stretch.reviewed ? "reviewed" : ""}`);
     entry.addEventListener("click", () => choose(index));
     return entry;

@@ -5,10 +5,11 @@ import { getArray } from "/static/api.js";
 
 const AXIS = { stroke: "#9aa4af", grid: { stroke: "#2c3137" }, ticks: { stroke: "#3a3f46" }, font: "11px system-ui" };
 const PLOTS = [
-  { key: "path", share: 0.46, label: "path", series: [["x [mm]", "#ff8f6b"], ["y [mm]", "#5aff7a"], ["z [mm]", "#6bb8ff"], ["u [px]", "#d5a6ff"], ["v [px]", "#ffe36b"]] },
-  { key: "residual", share: 0.27, label: "residual", series: [["residual [px]", "#ff8f6b"]] },
-  { key: "sigma", share: 0.27, label: "sigma", series: [["sigma [px]", "#6bb8ff"], ["sigma [mm]", "#5aff7a"]] },
+  { key: "path", share: 1.0, label: "path", series: [["x [mm]", "#ff8f6b"], ["y [mm]", "#5aff7a"], ["z [mm]", "#6bb8ff"], ["u [px]", "#d5a6ff"], ["v [px]", "#ffe36b"]] },
+  { key: "residual", share: 0.5, label: "residual", series: [["residual [px]", "#ff8f6b"]] },
+  { key: "sigma", share: 0.5, label: "sigma", series: [["sigma [px]", "#6bb8ff"], ["sigma [mm]", "#5aff7a"]] },
 ];
+const LEGEND_PX = 28; // below each plot
 const BANDS = { 0: "#ff5a4a33", 2: "#ffaa2833" }; // missing, filled
 
 export class Plots {
@@ -17,14 +18,17 @@ export class Plots {
     this.x = Float64Array.from({ length: rows }, (_, row) => row);
     for (const { key, series } of PLOTS) {
       const options = {
-        ...this.size(key), scales: { x: { time: false } }, cursor: { drag: { x: true, y: false }, sync: { key: "row" } },
-        axes: [{ ...AXIS, size: 26 }, { ...AXIS, size: 52 }, ...(key === "residual" ? [] : [{ ...AXIS, size: 52, side: 1, scale: "second", grid: { show: false } }])],
-        series: [{ label: "row" }, ...series.map(([label, stroke]) => ({ label, stroke, width: 1.2, spanGaps: false, scale: this.scaleOf(key, label), value: (_, v) => (v == null ? "-" : v.toFixed(3)) }))],
+        ...this.size(key), scales: { x: { time: false, range: [0, Math.max(rows - 1, 1)] } }, cursor: { drag: { x: false, y: false }, sync: { key: "row" }, points: { size: 4 } },
+        axes: [{ ...AXIS, size: 22, gap: 2 }, { ...AXIS, size: 52 }, ...(key === "residual" ? [] : [{ ...AXIS, size: 52, side: 1, scale: "second", grid: { show: false } }])],
+        series: [{ label: "row" }, ...series.map(([label, stroke]) => ({ label, stroke, width: 1.2, spanGaps: false, points: { show: false }, scale: this.scaleOf(key, label), value: (_, v) => (v == null ? "-" : v.toFixed(3)) }))],
         hooks: { drawClear: [(plot) => this.drawBands(plot)], draw: [(plot) => this.drawLine(plot)] },
       };
-      const plot = new uPlot(options, [this.x, ...series.map(() => new Array(rows).fill(null))], parent);
+      const box = document.createElement("div");
+      box.className = `plot ${key}`;
+      parent.append(box);
+      const plot = new uPlot(options, [this.x, ...series.map(() => new Array(rows).fill(null))], box);
       plot.root.dataset.plot = key;
-      plot.over.addEventListener("click", () => { if (plot.select.width < 3) this.jump(Math.round(plot.posToVal(plot.cursor.left, "x"))); });
+      plot.over.addEventListener("click", () => this.jump(Math.round(plot.posToVal(plot.cursor.left, "x"))));
       this.plots.push(plot);
     }
     new ResizeObserver(() => this.plots.forEach((plot, k) => plot.setSize(this.size(PLOTS[k].key)))).observe(parent);
@@ -34,7 +38,7 @@ export class Plots {
 
   size(key) {
     const { share } = PLOTS.find((plot) => plot.key === key);
-    return { width: Math.max(this.parent.clientWidth, 200), height: Math.max(Math.round(share * this.parent.clientHeight) - 26, 50) };
+    return { width: Math.max(Math.floor(this.parent.clientWidth / 2) - 6, 200), height: Math.max(Math.round(share * this.parent.clientHeight) - LEGEND_PX, 50) };
   }
 
   async load(name, marker, camera) {

@@ -11,7 +11,7 @@ const $ = (selector) => document.querySelector(selector);
 
 export class Recording {
   constructor(name) {
-    Object.assign(this, { name, row: 0, selected: [], camera: "", stretches: [], current: -1, writable: false, adding: false, stopped: false, wanted: 0, busy: Promise.resolve() });
+    Object.assign(this, { name, row: 0, selected: [], camera: "", stretches: [], current: -1, writable: false, adding: false, going: Promise.resolve(), stopped: false, wanted: 0, busy: Promise.resolve() });
     this.listening = new AbortController();
   }
 
@@ -196,8 +196,11 @@ export class Recording {
     $("#from").value = item.first;
     $("#to").value = item.last;
     if (item.camera) this.activate(item.camera);
-    this.select(item.marker, false);
-    this.show(item.first);
+    const row = item.kind === "jump" ? item.last : item.first; // of a jump, the first frame with the wrong dot
+    this.going = this.show(row).then(() => {
+      this.select(item.marker, false);
+      if (item.other >= 0) this.select(item.other, true);
+    });
   }
 
   stretch() {
@@ -213,6 +216,7 @@ export class Recording {
 
   async do(what) {
     try {
+      if (what !== "later" && what !== "earlier") await this.going; // what is done is done to what is shown
       const camera = this.camera;
       if (what === "later") this.goTo(Math.floor(this.current) + 1);
       else if (what === "earlier") this.goTo(Math.ceil(this.current) - 1);

@@ -3,7 +3,7 @@
 const COLOURS = { 1: "#5aff7a", 2: "#ffaa28", 3: "#ff5a4a" };
 const CHANGED = "#4cc9ff", SELECTED = "#ffffff", TRAIL = "#3c96ff";
 const TRAIL_ROWS = 15, REACH_PX = 14;
-const ELLIPSES = [20, 60, 0]; // sigmas at which they are drawn
+const ELLIPSES = [60, 200, 0]; // sigmas at which they are drawn
 
 export class CameraView {
   // calls: select(marker, more), move(camera, marker, x, y, hand), click(camera, x, y) -> whether it was used, activate(camera)
