@@ -145,7 +145,7 @@ def _taken_by(recording: OpenRecording, action: Action, dot: PointedDot) -> str:
     distance = np.nan_to_num(np.linalg.norm(pixel - dot.centre, axis=1), nan=np.inf)
     for marker in np.argsort(distance)[:2].tolist():
         if distance[marker] < dot.appearance.radius and recording.tracks.names[marker] != action.marker:
-            return recording.tracks.names[marker]
+            return str(recording.tracks.names[marker])
     return ""
 
 

@@ -3,12 +3,15 @@
 import os
 import re
 import shutil
+import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import uvicorn
 from filmed import Film, make_film, with_swapped
 from served import Served
 from starlette.testclient import TestClient
@@ -49,13 +52,34 @@ def client(film: Film) -> Iterator[TestClient]:
 
 
 @pytest.fixture
-def serve() -> Iterator[Callable[..., Served]]:
-    """Start `rafl-review` on a folder of tracks."""
+def serve() -> Iterator[Callable[[Path], str]]:
+    """Serve a folder of tracks in this process; returns the address."""
+    running: list[tuple[uvicorn.Server, threading.Thread]] = []
+
+    def start(folder: Path) -> str:
+        listener = socket.create_server(("127.0.0.1", 0))
+        port = listener.getsockname()[1]
+        app = create_server(Library(folder, None, "Ann"), TOKEN, port)
+        server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
+        thread.start()
+        running.append((server, thread))
+        return f"http://127.0.0.1:{port}/?token={TOKEN}"
+
+    yield start
+    for server, thread in running:
+        server.should_exit = True
+        thread.join(10)
+
+
+@pytest.fixture
+def launch() -> Iterator[Callable[[Path], Served]]:
+    """Start the command `rafl-review` on a folder of tracks."""
     running = []
 
-    def start(folder: Path, *options: str) -> Served:
+    def start(folder: Path) -> Served:
         program = "from rafl.review.cli import review_app; review_app()"
-        line = [sys.executable, "-c", program, str(folder), "--no-browser", "--name", "Ann", *options]
+        line = [sys.executable, "-c", program, str(folder), "--no-browser", "--name", "Ann"]
         environment = os.environ | {"PYTHONUNBUFFERED": "1"}
         process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
         running.append(process)

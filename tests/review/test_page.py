@@ -4,23 +4,29 @@ import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
-import h5py
 import numpy as np
 import pytest
+import torch
 from filmed import BIT_TOP, BIT_WIDTH, BITS, Film
 from playwright.sync_api import Browser, Page, sync_playwright
 from served import Served
 
+import rafl
+from rafl.calibration.rig import rig_text
+from rafl.capture.rendering.film import side_cameras
+from rafl.capture.rendering.motion import tip_load_release
+from rafl.capture.specimen.specimen import Specimen
 from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
-from rafl.tracking.reconstruction.tracks import read_tracks, write_tracks
+from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 OPTIONS = "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync"
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed: apt-get install chromium")
 
-Serve = Callable[..., Served]
+Serve = Callable[[Path], str]
+Launch = Callable[[Path], Served]
 # Reads the frame number that is drawn into a bitmap on the page's canvas.
 READ_COUNTER = f"""(camera) => {{
   const view = window.review.views.find((one) => one.camera === camera);
@@ -59,8 +65,8 @@ def page(browser: Browser, errors: list[str]) -> Iterator[Page]:
     context.close()
 
 
-def open_recording(page: Page, served: Served, name: str = "swing") -> None:
-    page.goto(served.address)
+def open_recording(page: Page, address: str, name: str = "swing") -> None:
+    page.goto(address)
     page.wait_for_selector("body[data-ready=list]")
     page.get_by_role("link", name=name, exact=True).click()
     page.wait_for_selector("body[data-ready=recording]")
@@ -197,16 +203,16 @@ def test_steps_zoom_plots_and_play(film: Film, serve: Serve, page: Page, errors:
     assert errors == []
 
 
-def test_killed_server_loses_nothing_that_was_confirmed(film: Film, serve: Serve, page: Page) -> None:
-    served = serve(film.path.parent)
-    open_recording(page, served)
+def test_killed_server_loses_nothing_that_was_confirmed(film: Film, launch: Launch, page: Page) -> None:
+    served = launch(film.path.parent)
+    open_recording(page, served.address)
     page.keyboard.press("n")
     page.keyboard.press("s")
     wait_for_correction(page, "swapped from frame 40")
     served.kill()
     np.testing.assert_allclose(read_corrected_tracks(film.path).tracks.position, film.tracks.position, atol=1e-9)
-    again = serve(film.path.parent)
-    open_recording(page, again)
+    again = launch(film.path.parent)
+    open_recording(page, again.address)
     assert page.locator("#corrections li").count() == 1
     assert again.stop() == 0
 
@@ -249,9 +255,9 @@ def test_hostile_names_do_nothing(film: Film, serve: Serve, page: Page, errors: 
 def test_thousand_recordings(film: Film, serve: Serve, page: Page) -> None:
     for number in range(1000):
         shutil.copy(film.path, film.path.parent / f"take{number:04d}.h5")
-    served = serve(film.path.parent)
+    address = serve(film.path.parent)
     start = time.perf_counter()
-    page.goto(served.address)
+    page.goto(address)
     page.wait_for_selector("body[data-ready=list]")
     page.wait_for_function("() => document.querySelector('#rows tr:nth-child(5)').cells[1].textContent === '80'")
     taken = time.perf_counter() - start
@@ -262,40 +268,39 @@ def test_thousand_recordings(film: Film, serve: Serve, page: Page) -> None:
 
 
 def test_swap_made_on_the_page_is_in_the_dataset(
-    tmp_path: Path, specimen_file: Path, serve: Serve, page: Page, run: Callable[..., Any]
+    tmp_path: Path, small_specimen: Specimen, specimen_file: Path, serve: Serve, page: Page
 ) -> None:
-    """The demonstration's road, with a recording in which the tracker exchanged two markers."""
-    options = ("--loads-g", "60", "--frames", "18", "--youngs-modulus", "300000")
-    for command in (
-        ("rafl-render", specimen_file, "--out", "film", *options),
-        ("rafl-calibrate", "film/calibration", "--out", "calib.yaml"),
-        ("rafl-track", "film/videos", "--calib", "calib.yaml", "--specimen", specimen_file),
-    ):
-        result = run(*command)
-        assert result.returncode == 0, result.stderr
-    path = tmp_path / "tracks/load060g.h5"
-    with h5py.File(path, "a") as file:
-        names = [str(name) for name in file.attrs["marker_names"]]
-        pair = [names.index("La2"), names.index("La3")]
-        of_camera = [f"cameras/left/{key}" for key in ("pixel", "pixel_sigma", "residual")]
-        for key in ("position", "sigma", "state", *of_camera):
-            values = file[key][()]
-            values[9:, pair] = values[9:, pair[::-1]]
-            file[key][...] = values
+    """A release that the tracker has followed with two markers exchanged from row 9 on."""
+    motion = tip_load_release(small_specimen, small_specimen.material, 0.06, 18, 100.0)
+    markers = small_specimen.markers(1e-3)
+    truth = markers.positions(torch.from_numpy(motion.q)).numpy()
+    rig = side_cameras(small_specimen, [motion], np.random.default_rng(0))
+    on_left = np.array([name.startswith("L") for name in markers.names])
+    pixels = {}
+    for camera, seen in (("left", on_left), ("right", ~on_left)):
+        path = np.where(seen[:, None], rig.cameras[camera].project(truth), np.nan)
+        if camera == "left":
+            path[9:, [1, 2]] = path[9:, [2, 1]]
+        pixels[camera] = CameraPixels(path, np.where(seen[:, None], 0.02, np.full_like(path, np.nan)))
+    position, sigma, residual = triangulate(rig, pixels)
+    each = {camera: np.zeros(18, bool) for camera in pixels}
+    tracks = Tracks(
+        names=tuple(markers.names), time=0.01 * np.arange(18), position=position, sigma=sigma,
+        state=np.ones(truth.shape[:2], np.uint8), pixel={camera: item.pixel for camera, item in pixels.items()},
+        residual=residual, pixel_sigma={camera: item.sigma for camera, item in pixels.items()}, damaged=each,
+        frame={camera: np.arange(18) for camera in pixels}, images={camera: {} for camera in pixels}, fps=100.0,
+        calibration=rig_text(rig), sources={}, settings="", longest_gap=5,
+    )  # fmt: skip
+    write_tracks(tmp_path / "tracks/load060g.h5", tracks)
     open_recording(page, serve(tmp_path / "tracks"), "load060g")
     page.keyboard.press("n")
-    page.wait_for_selector("body[data-row='9'][data-selected='La2,La3']")
+    page.wait_for_selector("body[data-row='9'][data-selected='La1,La2']")
+    assert "no video of camera left" in page.locator("[data-camera=left] .label").inner_text()
     page.keyboard.press("s")
-    wait_for_correction(page, "La2 and La3 swapped from frame 9 of left on")
+    wait_for_correction(page, "La1 and La2 swapped from frame 9 of left on")
     (tmp_path / "recordings.csv").write_text("recording,load_g,split\nload060g,60,train\n")
-    result = run("rafl-capture", specimen_file, "tracks", "--recordings", "recordings.csv", "--out", "small.h5")
-    assert result.returncode == 0, result.stderr
-    with h5py.File(tmp_path / "small.h5") as file, h5py.File(tmp_path / "film/truth.h5") as truth:
-        item = file["trajectories/load060g"]
-        assert str(item.attrs["corrections"]).startswith("1 of load060g.corrections.yaml ")
-        order = [str(name) for name in file["markers/names"].asstr()[()]]
-        where = [names.index(name) for name in order]
-        start = int(item.attrs["first_frame"])
-        true = truth["load060g/position"][()][start:, where]
-        error = item["markers"][()] - true[: len(item["markers"])]
-        assert np.nanmax(np.abs(error[..., [0, 2]])) < 5e-4
+    item = rafl.build_dataset(specimen_file, tmp_path / "tracks", tmp_path / "recordings.csv").trajectories["load060g"]
+    assert str(item.attributes["corrections"]).startswith("1 of load060g.corrections.yaml ")
+    start = int(str(item.attributes["first_frame"]))
+    error = item.markers - truth[start : start + len(item.markers)]
+    assert np.nanmax(np.abs(error[..., [0, 2]])) < 2e-4

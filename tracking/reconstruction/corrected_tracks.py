@@ -174,7 +174,7 @@ class _Work:
     @apply.register
     def _(self, correction: Swap) -> None:
         camera = self._camera(correction.camera)
-        pair = [self._column(marker) for marker in correction.markers]
+        pair = np.array([self._column(marker) for marker in correction.markers])
         frame = self.tracks.frame[camera]
         if frame.max() < correction.first:
             raise _UnfitError(f"camera {camera} has frames up to {frame.max()}, not {correction.first}")
@@ -229,11 +229,12 @@ class _Work:
             self.tracks = replace(
                 tracks,
                 names=(*tracks.names, marker),
-                **{key: wider(getattr(tracks, key)) for key in ("position", "sigma", "state")},
-                **{
-                    key: {camera: wider(values) for camera, values in getattr(tracks, key).items()}
-                    for key in ("pixel", "pixel_sigma", "residual")
-                },
+                position=wider(tracks.position),
+                sigma=wider(tracks.sigma),
+                state=wider(tracks.state),
+                pixel={camera: wider(values) for camera, values in tracks.pixel.items()},
+                pixel_sigma={camera: wider(values) for camera, values in tracks.pixel_sigma.items()},
+                residual={camera: wider(values) for camera, values in tracks.residual.items()},
             )
         except InputError as error:
             raise _UnfitError(str(error)) from None
@@ -254,7 +255,8 @@ class _Work:
         before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(time) - 1)
         velocity = (path[after] - path[before]) / (time[after] - time[before])[:, None, None]
         own = velocity[:, column]
-        others = np.ma.median(np.ma.masked_invalid(velocity), axis=1).filled(0.0)
+        known = np.isfinite(velocity)
+        others = np.where(known, velocity, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
         shift = lag[rows, None] * np.where(np.isfinite(own), own, others)
         return pixel - shift, np.hypot(sigma, LAG_ERROR * shift)
 

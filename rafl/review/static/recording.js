@@ -5,7 +5,7 @@ import { Plots } from "/static/plots.js";
 import { showCorrections, showNotes, showStretches } from "/static/panels.js";
 import { CameraView } from "/static/view.js";
 
-const CLAIM_MS = 3000;
+const CLAIM_MS = 1500;
 const PREFETCHED = 4; // frames ahead of the one shown
 const $ = (selector) => document.querySelector(selector);
 
