@@ -15,7 +15,7 @@ from rafl.simulation.time_integration import INTEGRATORS
 from rafl.tracking import cli as tracking_cli
 from rafl.tracking.reconstruction.export import WRITERS
 
-HEAVY = {"cv2", "h5py", "matplotlib", "numba", "numpy", "pandas", "scipy", "sympy", "torch", "trimesh"}
+HEAVY = {"cv2", "fastapi", "h5py", "matplotlib", "numba", "numpy", "pandas", "scipy", "sympy", "torch", "trimesh"}
 PROGRAM = """
 import sys
 from importlib.metadata import entry_points
@@ -44,6 +44,8 @@ REFUSED = [
     ["rafl-fit", "absent.h5", "--method", "magic"],
     ["rafl-eval", "run"],
     ["rafl-eval", "run", "absent.h5"],
+    ["rafl-review", "absent"],
+    ["rafl-review", ".", "--videos", "absent"],
 ]
 COMMANDS = sorted({line[0] for line in REFUSED})
 

@@ -84,6 +84,15 @@ def dot_at(image: Array, position: Array, markers: Array) -> PointedDot | None:
     return min(found, key=lambda item: item[:2])[2] if found else None
 
 
+def load_kernels() -> None:
+    """Load the compiled code of `dot_at` and `follow_on`, so that the first dot does not wait for it."""
+    x, y = np.meshgrid(np.arange(80.0), np.arange(80.0))
+    image = np.where(np.hypot(x - 40.0, y - 40.0) < 7.0, 40, 170).astype(np.uint8)
+    dot = dot_at(image, np.array([40.0, 40.0]), np.array([[40.0, 40.0]]))
+    if dot is not None:
+        list(follow_on(dot, 0, np.full((2, 1, 2), np.nan), np.arange(2), lambda row: image))
+
+
 def _moved(dots: Dots, corner: NDArray[np.int64]) -> Dots:
     """Dots of a part of a frame in the pixels of the frame."""
     parameters = dots.parameters.copy()

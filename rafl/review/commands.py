@@ -2,11 +2,13 @@
 
 import secrets
 import socket
+import threading
 import webbrowser
 from pathlib import Path
 
 import typer
 import uvicorn
+from threadpoolctl import threadpool_limits
 
 from rafl.common.command_line import one_line
 from rafl.common.errors import InputError
@@ -14,6 +16,7 @@ from rafl.common.interruption import Terminated
 from rafl.common.kernels import announce_compilation
 from rafl.review.recordings import Library
 from rafl.review.server import create_server
+from rafl.tracking.single_marker import load_kernels
 
 HOST = "127.0.0.1"
 SHUTDOWN_S = 2  # for requests that are being answered when the command is stopped
@@ -36,7 +39,8 @@ def serve(tracks: Path, videos: Path | None, who: str, port: int, browser: bool)
     if not library.names():
         raise InputError(f"expected tracks (.h5) in {tracks}, found none; track the videos with rafl-track")
     announce_compilation()
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as listener:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
+        # With its protocol named, connections send at once instead of waiting for acknowledgements (TCP_NODELAY).
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             listener.bind((HOST, port))
@@ -44,6 +48,7 @@ def serve(tracks: Path, videos: Path | None, who: str, port: int, browser: bool)
         except OSError as error:
             raise InputError(f"--port: expected a free port, found {port}: {error.strerror}; choose another") from None
         port = listener.getsockname()[1]
+        threading.Thread(target=load_kernels, daemon=True).start()
         token = secrets.token_urlsafe(24)
         address = f"http://{HOST}:{port}/?token={token}"
         typer.echo(f"{len(library.names())} recordings in {one_line(str(tracks))}; Ctrl-C ends")
@@ -51,7 +56,8 @@ def serve(tracks: Path, videos: Path | None, who: str, port: int, browser: bool)
         app = create_server(library, token, port, (lambda: webbrowser.open(address)) if browser else None)
         config = uvicorn.Config(app, log_level="error", access_log=False, timeout_graceful_shutdown=SHUTDOWN_S)
         try:
-            uvicorn.Server(config).run(sockets=[listener])
+            with threadpool_limits(1, user_api="blas"):  # threads for matrices this small would only wait
+                uvicorn.Server(config).run(sockets=[listener])
         except KeyboardInterrupt as error:
             if isinstance(error, Terminated):
                 raise

@@ -155,7 +155,7 @@ class OpenRecording:
         on_disk = self.beside.read_bytes() if self.beside.exists() else None
         if on_disk != self.text:
             raise InputError(f"{self.beside.name} was changed by another program; load the page again")
-        found = apply_corrections(self.raw, corrections, self.path)
+        found = apply_corrections(self.raw, corrections, self.path, self.found)
         rejected = [line for line in found.unfit if line not in self.found.unfit]
         if new and rejected:
             raise InputError(rejected[-1].partition(": ")[2])

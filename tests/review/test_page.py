@@ -271,7 +271,7 @@ def test_swap_made_on_the_page_is_in_the_dataset(
     tmp_path: Path, small_specimen: Specimen, specimen_file: Path, serve: Serve, page: Page
 ) -> None:
     """A release that the tracker has followed with two markers exchanged from row 9 on."""
-    motion = tip_load_release(small_specimen, small_specimen.material, 0.06, 18, 100.0)
+    motion = tip_load_release(small_specimen, small_specimen.material, 0.06, 40, 100.0)
     markers = small_specimen.markers(1e-3)
     truth = markers.positions(torch.from_numpy(motion.q)).numpy()
     rig = side_cameras(small_specimen, [motion], np.random.default_rng(0))
@@ -283,12 +283,12 @@ def test_swap_made_on_the_page_is_in_the_dataset(
             path[9:, [1, 2]] = path[9:, [2, 1]]
         pixels[camera] = CameraPixels(path, np.where(seen[:, None], 0.02, np.full_like(path, np.nan)))
     position, sigma, residual = triangulate(rig, pixels)
-    each = {camera: np.zeros(18, bool) for camera in pixels}
+    each = {camera: np.zeros(40, bool) for camera in pixels}
     tracks = Tracks(
-        names=tuple(markers.names), time=0.01 * np.arange(18), position=position, sigma=sigma,
+        names=tuple(markers.names), time=0.01 * np.arange(40), position=position, sigma=sigma,
         state=np.ones(truth.shape[:2], np.uint8), pixel={camera: item.pixel for camera, item in pixels.items()},
         residual=residual, pixel_sigma={camera: item.sigma for camera, item in pixels.items()}, damaged=each,
-        frame={camera: np.arange(18) for camera in pixels}, images={camera: {} for camera in pixels}, fps=100.0,
+        frame={camera: np.arange(40) for camera in pixels}, images={camera: {} for camera in pixels}, fps=100.0,
         calibration=rig_text(rig), sources={}, settings="", longest_gap=5,
     )  # fmt: skip
     write_tracks(tmp_path / "tracks/load060g.h5", tracks)

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -72,6 +74,57 @@ def test_list_and_summaries(client: TestClient, film: Film) -> None:
     assert (summary["swing"]["frames"], summary["swing"]["markers"], summary["swing"]["cameras"]) == (80, 15, 2)
     assert "broken.h5" in summary["broken"]["error"]
     assert "error" in summary["nothing"]
+
+
+def test_speed_on_a_film_of_ten_thousand_frames(client: TestClient, film: Film) -> None:
+    """Every correction, on markers of which all 10,000 rows are drawn; the limits leave room for a busy machine."""
+    tracks, rows = film.tracks, np.arange(10_000)
+    random = np.random.default_rng(1)
+    periods = {key: getattr(tracks, key)[rows % 40 + 30] for key in ("position", "sigma", "state")}
+    cameras = {
+        key: {camera: values[rows % 40 + 30] for camera, values in getattr(tracks, key).items()}
+        for key in ("pixel", "pixel_sigma", "residual", "damaged", "lag")
+    }
+    shown = {camera: rows for camera in tracks.pixel}
+    long = replace(tracks, time=rows / 50.0, frame=shown, **periods, **cameras)
+    write_tracks(film.path.parent / "long.h5", long)
+    times = {}
+    for number in range(20):
+        row, marker = int(random.integers(100, 9900)), int(random.integers(0, 9))
+        actions = {
+            "hand": {"kind": "place", "x": 100.0, "y": 90.0, "hand": True},
+            "delete": {"kind": "delete", "last_row": row + 3, "all_cameras": True},
+            "accept": {"kind": "accept", "last_row": row + 3},
+            "undo": {"kind": "undo"},
+        }
+        what = list(actions)[number % 4]
+        action = {"camera": "left", "marker": tracks.names[marker], "row": row} | actions[what]
+        start = time.perf_counter()
+        answer = client.post("/api/correct", params={"name": "long", "page": "one"}, json=action)
+        times[f"{number} {what}"] = time.perf_counter() - start
+        assert answer.status_code == 200, answer.text
+    print({key: f"{1e3 * value:.0f} ms" for key, value in times.items()})
+    assert max(times.values()) < 2.0
+    assert np.median(list(times.values())) < 0.5
+    start = time.perf_counter()
+    assert client.get("/api/frame", params=NAME | {"camera": "left", "number": 70}).status_code == 200
+    assert time.perf_counter() - start < 1.0
+
+
+def test_corrections_one_by_one_and_at_once_agree(client: TestClient, film: Film) -> None:
+    """What the page computes after each correction, also after taking some back, is what reading the file gives."""
+    correct(client, kind="swap", camera="left", marker="A1", other="B1", row=40)
+    correct(client, kind="delete", camera="left", marker="C2", row=3, last_row=6, all_cameras=True)
+    correct(client, kind="delete", camera="left", marker="C2", row=3, last_row=6)
+    correct(client, kind="place", camera="left", marker="C2", row=5, x=101.0, y=222.0, hand=True, sigma=9.0)
+    for kind in ("undo", "undo", "undo", "redo", "redo"):
+        correct(client, kind=kind)
+    found = read_corrected_tracks(film.path).tracks
+    values = np.frombuffer(client.get("/api/block", params=NAME | {"first": 0, "count": 80}).content, "<f4")
+    markers = len(found.names)
+    np.testing.assert_array_equal(values[80 : 80 + 80 * markers].reshape(80, markers), found.state)
+    position = values[80 + 160 * markers : 80 + 400 * markers].reshape(80, markers, 3)
+    np.testing.assert_allclose(position, 1e3 * found.position, atol=1e-4)
 
 
 def test_worst_stretches_come_first_and_accepted_ones_are_reviewed(client: TestClient) -> None:

@@ -38,6 +38,7 @@ class CorrectedTracks:
         corrections: those in the file.
         changed: whether a camera's pixel of the marker was changed, (T, M).
         accepted: whether somebody has accepted the marker as it is there, (T, M).
+        emptied: where a filled gap was deleted, (T, M).
         unfit: a line for each correction that does not fit the tracks and was left out.
     """
 
@@ -45,6 +46,7 @@ class CorrectedTracks:
     corrections: tuple[Correction, ...]
     changed: NDArray[np.bool_]
     accepted: NDArray[np.bool_]
+    emptied: NDArray[np.bool_]
     unfit: tuple[str, ...]
 
 
@@ -75,7 +77,9 @@ def with_corrections(tracks: Tracks, path: Path) -> CorrectedTracks:
     return replace(found, tracks=replace(found.tracks, notes=(*tracks.notes, *notes)))
 
 
-def apply_corrections(tracks: Tracks, corrections: tuple[Correction, ...], source: Path) -> CorrectedTracks:
+def apply_corrections(
+    tracks: Tracks, corrections: tuple[Correction, ...], source: Path, before: CorrectedTracks | None = None
+) -> CorrectedTracks:
     """Apply corrections one after the other, and reconstruct the markers anew in the frames concerned.
 
     Gaps that have, or border on, a corrected measurement are filled anew.
@@ -84,6 +88,8 @@ def apply_corrections(tracks: Tracks, corrections: tuple[Correction, ...], sourc
         tracks: as tracked.
         corrections: in order.
         source: the tracks file, for error messages.
+        before: the same tracks with other corrections, known from an earlier call. Only what differs is computed, which
+            saves time.
 
     Raises:
         InputError: the tracks hold no calibration.
@@ -95,11 +101,15 @@ def apply_corrections(tracks: Tracks, corrections: tuple[Correction, ...], sourc
             work.apply(correction)
         except _UnfitError as error:
             unfit.append(f"correction {number} ({correction.kind}, by {correction.by}) is left out: {error}")
-    result = work.tracks
-    if work.changed.any():
+    result, differs = work.tracks, work.changed
+    if before is not None and len(before.tracks.names) == len(result.names):
+        known = before.tracks
+        differs = _differing(work, before)
+        result = replace(result, position=known.position, sigma=known.sigma, state=known.state, residual=known.residual)
+    if differs.any():
         if not tracks.calibration:
             raise InputError(f"{source}: expected the calibration with which it was tracked, found none; track again")
-        result = _reconstruct(result, work.changed, source)
+        result = _reconstruct(result, differs, source)
     if (emptied := work.emptied & (result.state == FILLED)).any():
         nowhere = np.where(emptied[..., None], np.nan, 0.0)
         result = replace(
@@ -108,7 +118,18 @@ def apply_corrections(tracks: Tracks, corrections: tuple[Correction, ...], sourc
             sigma=result.sigma + nowhere,
             state=np.where(emptied, np.uint8(MISSING), result.state),
         )
-    return CorrectedTracks(result, corrections, work.changed, work.accepted, tuple(unfit))
+    return CorrectedTracks(result, corrections, work.changed, work.accepted, work.emptied, tuple(unfit))
+
+
+def _differing(work: "_Work", before: CorrectedTracks) -> NDArray[np.bool_]:
+    """The measurements that are others than before, and the gaps that are to be filled again, (T, M)."""
+    differs = before.emptied & ~work.emptied
+    columns = np.flatnonzero((work.changed | before.changed).any(axis=0))
+    for key in ("pixel", "pixel_sigma"):
+        for camera, values in getattr(work.tracks, key).items():
+            new, old = values[:, columns], getattr(before.tracks, key)[camera][:, columns]
+            differs[:, columns] |= ((new != old) & ~(np.isnan(new) & np.isnan(old))).any(axis=-1)
+    return differs
 
 
 class _UnfitError(Exception):
@@ -125,7 +146,6 @@ class _Work:
         self.changed = np.zeros(tracks.state.shape, bool)
         self.accepted = np.zeros(tracks.state.shape, bool)
         self.emptied = np.zeros(tracks.state.shape, bool)  # where no gap is filled
-        self.rows: dict[str, dict[int, int]] = {}
 
     @singledispatchmethod
     def apply(self, correction: Correction) -> None:
@@ -140,15 +160,15 @@ class _Work:
     def _(self, correction: Place) -> None:
         camera = self._camera(correction.camera)
         values = correction.positions
-        row_of = self.rows.setdefault(camera, self.tracks.rows_by_frame(camera))
-        frames = values[:, 0].astype(int).tolist()
-        absent = [frame for frame in frames if frame not in row_of]
-        if absent:
+        frames = values[:, 0].astype(int)
+        shown, first_rows = np.unique(self.tracks.frame[camera], return_index=True)
+        there = np.minimum(np.searchsorted(shown, frames), len(shown) - 1)
+        if (absent := frames[shown[there] != frames]).size:
             raise _UnfitError(f"no row of the tracks shows frame {absent[0]} of camera {camera}")
         if correction.new and correction.marker not in self.tracks.names:
             self._add_marker(correction.marker)
         column = self._column(correction.marker)
-        rows = np.array([row_of[frame] for frame in frames])
+        rows = first_rows[there]
         pixel, sigma = self._at_row_times(camera, column, rows, values[:, 1:3], values[:, 3:])
         self.tracks.pixel[camera][rows, column] = pixel
         self.tracks.pixel_sigma[camera][rows, column] = sigma

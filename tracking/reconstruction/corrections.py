@@ -10,9 +10,10 @@ import yaml
 from numpy.typing import NDArray
 from pydantic import AfterValidator, AwareDatetime, Field, model_validator
 
+from rafl.common.errors import InputError
 from rafl.common.files import write_text
 from rafl.common.names import Name, check_visible
-from rafl.common.yaml_files import LARGEST, StrictModel, read_yaml
+from rafl.common.yaml_files import LARGEST, MAX_YAML_BYTES, StrictModel, read_yaml
 
 Array = NDArray[Any]
 
@@ -166,7 +167,12 @@ def write_corrections(path: Path, corrections: tuple[Correction, ...]) -> None:
     Raises:
         InputError: the file cannot be written, or would be too large to be read again.
     """
-    write_text(path, corrections_text(corrections), read_corrections)
+    text = corrections_text(corrections)
+    if len(text.encode()) > MAX_YAML_BYTES:  # far more than a person corrects, except by following many markers on
+        raise InputError(
+            f"{path}: expected at most {MAX_YAML_BYTES / 1e6:g} MB of corrections, found more; take the last one back"
+        )
+    write_text(path, text)
 
 
 class _Dumper(yaml.SafeDumper):
