@@ -57,6 +57,7 @@ docs: install build/types
 # The pictures of the site's gallery, from the demonstration's output.
 gallery: demo
 	$(BIN)/python docs/gallery.py $(DEMO)
+	$(BIN)/python docs/gallery_review.py $(DEMO)
 
 # The package for other people's environments, in dist/.
 wheel: install

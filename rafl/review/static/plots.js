@@ -3,12 +3,13 @@
 import uPlot from "/static/uPlot.esm.js";
 import { getArray } from "/static/api.js";
 
-const AXIS = { stroke: "#9aa4af", grid: { stroke: "#2c3137" }, ticks: { stroke: "#3a3f46" }, font: "11px system-ui" };
+const AXIS = { stroke: "#9aa4af", grid: { stroke: "#2c3137" }, ticks: { stroke: "#3a3f46" }, font: "11px system-ui", values: (_, ticks) => ticks.map((tick) => Number(tick.toPrecision(4))) };
 const PLOTS = [
   { key: "path", share: 1.0, label: "path", series: [["x [mm]", "#ff8f6b"], ["y [mm]", "#5aff7a"], ["z [mm]", "#6bb8ff"], ["u [px]", "#d5a6ff"], ["v [px]", "#ffe36b"]] },
   { key: "residual", share: 0.5, label: "residual", series: [["residual [px]", "#ff8f6b"]] },
   { key: "sigma", share: 0.5, label: "sigma", series: [["sigma [px]", "#6bb8ff"], ["sigma [mm]", "#5aff7a"]] },
 ];
+const FROM_ZERO = { range: (plot, least, most) => [0, 1.1 * most || 1] };
 const LEGEND_PX = 28; // below each plot
 const BANDS = { 0: "#ff5a4a33", 2: "#ffaa2833" }; // missing, filled
 
@@ -18,9 +19,9 @@ export class Plots {
     this.x = Float64Array.from({ length: rows }, (_, row) => row);
     for (const { key, series } of PLOTS) {
       const options = {
-        ...this.size(key), scales: { x: { time: false, range: [0, Math.max(rows - 1, 1)] } }, cursor: { drag: { x: false, y: false }, sync: { key: "row" }, points: { size: 4 } },
-        axes: [{ ...AXIS, size: 22, gap: 2 }, { ...AXIS, size: 52 }, ...(key === "residual" ? [] : [{ ...AXIS, size: 52, side: 1, scale: "second", grid: { show: false } }])],
-        series: [{ label: "row" }, ...series.map(([label, stroke]) => ({ label, stroke, width: 1.2, spanGaps: false, points: { show: false }, scale: this.scaleOf(key, label), value: (_, v) => (v == null ? "-" : v.toFixed(3)) }))],
+        ...this.size(key), scales: { x: { time: false, range: [0, Math.max(rows - 1, 1)] }, ...(key === "path" ? {} : { y: FROM_ZERO, second: FROM_ZERO }) }, legend: { live: false }, cursor: { drag: { x: false, y: false }, sync: { key: "row" }, points: { size: 4 } },
+        axes: [{ ...AXIS, size: 22, gap: 2 }, { ...AXIS, size: 52, space: 24 }, ...(key === "residual" ? [] : [{ ...AXIS, size: 52, side: 1, space: 24, scale: "second", grid: { show: false } }])],
+        series: [{}, ...series.map(([label, stroke]) => ({ label, stroke, width: 1.2, spanGaps: false, points: { show: false }, scale: this.scaleOf(key, label) }))],
         hooks: { drawClear: [(plot) => this.drawBands(plot)], draw: [(plot) => this.drawLine(plot)] },
       };
       const box = document.createElement("div");
@@ -70,6 +71,13 @@ export class Plots {
   }
 
   drawLine(plot) {
+    if (plot.root.dataset.plot === "residual" && this.state && plot.data[1].every((value) => value === null)) {
+      plot.ctx.fillStyle = AXIS.stroke;
+      plot.ctx.save();
+      plot.ctx.textAlign = "left";
+      plot.ctx.fillText("no other camera sees this marker", plot.bbox.left + 10, plot.bbox.top + plot.bbox.height / 2);
+      plot.ctx.restore();
+    }
     const { top, height, left, width } = plot.bbox, x = plot.valToPos(this.row, "x", true);
     if (x < left || x > left + width) return;
     plot.ctx.fillStyle = "#fffc";
