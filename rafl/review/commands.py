@@ -53,7 +53,8 @@ def serve(tracks: Path, videos: Path | None, who: str, port: int, browser: bool)
         address = f"http://{HOST}:{port}/?token={token}"
         typer.echo(f"{len(library.names())} recordings in {one_line(str(tracks))}; Ctrl-C ends")
         typer.echo(f"open {address}")
-        app = create_server(library, token, port, (lambda: webbrowser.open(address)) if browser else None)
+        opening = threading.Thread(target=webbrowser.open, args=(address,), daemon=True)
+        app = create_server(library, token, port, opening.start if browser else None)
         config = uvicorn.Config(app, log_level="error", access_log=False, timeout_graceful_shutdown=SHUTDOWN_S)
         try:
             with threadpool_limits(1, user_api="blas"):  # threads for matrices this small would only wait

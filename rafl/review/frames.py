@@ -25,6 +25,7 @@ class FrameStore:
     def __init__(self, video: Video) -> None:
         self.frames = open_frames(video)
         self.decoding = threading.Lock()
+        self.closed = False
         self.cache: OrderedDict[int, bytes | None] = OrderedDict()
         self.cached_bytes = 0
         self.caching = threading.Lock()
@@ -35,7 +36,7 @@ class FrameStore:
     def image(self, number: int) -> Array | None:
         """Grey levels of a frame, (H, W); None if it is damaged or absent."""
         with self.decoding:
-            return self.frames.image(number)
+            return None if self.closed else self.frames.image(number)
 
     def jpeg(self, number: int) -> bytes | None:
         """A frame as a grey JPEG image; None if it is damaged or absent. Those after it are prepared."""
@@ -45,16 +46,18 @@ class FrameStore:
         self.step = -1 if number < self.shown else 1
         self.shown = number
         with self.caching:
-            if not self.preparing:
+            if not self.preparing and not self.closed:
                 self.preparing = True
                 self.background.submit(self._prepare)
         return content
 
     def close(self) -> None:
         """End the work in the background and close the file."""
-        self.background.shutdown(cancel_futures=True)
         with self.decoding:
+            self.closed = True
             self.frames.close()
+        with self.caching:
+            self.background.shutdown(wait=False, cancel_futures=True)
 
     def _look_up(self, number: int) -> tuple[bool, bytes | None]:
         with self.caching:
@@ -91,4 +94,6 @@ class FrameStore:
         behind = range(self.shown - 1, max(self.shown - BEHIND, 0) - 1, -1)
         wanted = (*ahead,) if self.step > 0 else (*behind, *ahead)
         with self.caching:
+            if self.closed:
+                return None
             return next((number for number in wanted if number not in self.cache), None)

@@ -41,7 +41,7 @@ class OpenRecording:
     Attributes:
         raw: the tracks as tracked.
         found: the tracks with the corrections.
-        revision: number of changes since the recording was opened.
+        revision: grows with every change, also beyond the time for which the recording is open.
         editing: lock that whoever changes corrections holds.
     """
 
@@ -54,7 +54,7 @@ class OpenRecording:
         self.text = self.beside.read_bytes() if self.beside.exists() else None
         self.found = apply_corrections(self.raw, self.corrections, path)
         self.undone: list[tuple[Correction, ...]] = []
-        self.revision = 0
+        self.revision = time.time_ns() // 1_000_000
         self.editing = threading.RLock()
         self.stores: dict[str, FrameStore] = {}
         self.opening = threading.Lock()
