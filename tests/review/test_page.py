@@ -162,6 +162,19 @@ def test_every_correction_by_mouse_and_keyboard(film: Film, serve: Serve, page: 
     page.wait_for_function("() => !window.review.following && !document.body.dataset.acting")
     found = read_corrected_tracks(film.path).tracks
     assert np.abs(found.pixel["left"][10:31, 14] - film.tracks.pixel["left"][10:31, 14]).max() < 0.2
+    # A lost marker's cross is dragged onto the dot that comes back, and followed on.
+    click_marker(page, "left", "B4")
+    page.keyboard.press("d")
+    wait_for_correction(page, "B4 deleted in frames 10 to 30 of left")
+    x, y = position_of(page, "left", "B4")
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 4, y + 4, steps=2)
+    page.mouse.up()
+    page.wait_for_function("() => window.review.state.corrections.length === 8")
+    page.wait_for_function("() => !window.review.following && !document.body.dataset.acting")
+    found = read_corrected_tracks(film.path).tracks
+    assert np.abs(found.pixel["left"][10:31, 8] - film.tracks.pixel["left"][10:31, 8]).max() < 0.2
     # Rename, accept.
     click_marker(page, "left", "A2")
     page.fill("#name", "Tip")
@@ -169,9 +182,9 @@ def test_every_correction_by_mouse_and_keyboard(film: Film, serve: Serve, page: 
     wait_for_correction(page, "A2 is now Tip")
     page.get_by_role("button", name="Accept").click()
     wait_for_correction(page, "Tip accepted in frames 10 to 30")
-    assert page.locator("#corrections li").count() == 7
+    assert page.locator("#corrections li").count() == 10
     assert "Ann" in page.locator("#corrections li").first.inner_text()
-    for _ in range(8):
+    for _ in range(11):
         page.get_by_role("button", name="Undo").click() if page.locator("#undo").is_enabled() else None
         page.wait_for_function("() => !document.body.dataset.acting")
     np.testing.assert_array_equal(read_corrected_tracks(film.path).tracks.position, read_tracks(film.path).position)

@@ -30,7 +30,7 @@ export class Recording {
     $("#plots").replaceChildren();
     const calls = {
       select: (marker, more) => this.select(marker, more),
-      move: (camera, marker, x, y, hand) => this.act({ kind: "place", camera, marker: this.state.names[marker], x, y, hand, sigma: Number($("#sigma").value) || 1 }),
+      move: (camera, marker, x, y, hand) => this.move(camera, marker, x, y, hand),
       click: (camera, x, y) => this.adding && (this.add(camera, x, y), true),
       activate: (camera) => this.activate(camera),
     };
@@ -239,6 +239,14 @@ export class Recording {
     } catch (error) {
       this.say(error.message, true);
     }
+  }
+
+  // A marker that was lost is followed on from where it is put back.
+  async move(camera, marker, x, y, hand) {
+    const name = this.state.names[marker], { block, at } = this.data.at(this.row);
+    const lost = block.cameras[camera].kind[at * this.state.names.length + marker] !== 1;
+    const answer = await this.act({ kind: "place", camera, marker: name, x, y, hand, sigma: Number($("#sigma").value) || 1 });
+    if (answer && lost && !hand) await this.follow(camera, name);
   }
 
   async add(camera, x, y) {
