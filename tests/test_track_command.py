@@ -42,6 +42,18 @@ def test_track_a_folder_of_images(videos: Path, run: Run, tmp_path: Path) -> Non
     assert (tmp_path / "tracks/swing_front_overlay.mp4").stat().st_size > 1000
 
 
+def test_tracks_name_the_video_as_it_was_given(videos: Path, run: Run, tmp_path: Path) -> None:
+    """Also where a link leads to it: its own name may be another."""
+    (tmp_path / "linked").mkdir()
+    (tmp_path / "linked" / "take1").symlink_to(videos / "swing")
+    result = run("rafl-track", tmp_path / "linked", "--calib", "calib.yaml", "--fps", "50", "--out", "a/tracks")
+    assert result.returncode == 0, result.stderr
+    (path,) = (tmp_path / "a/tracks").glob("*.h5")
+    with h5py.File(path) as file:
+        assert file["cameras/front"].attrs["video"] == "../../linked/take1"
+        assert [line.split("  ")[1] for line in file.attrs["sources"]] == ["take1"]
+
+
 def test_track_refuses_wrong_input(videos: Path, run: Run, tmp_path: Path) -> None:
     before = folder_content(tmp_path)
 

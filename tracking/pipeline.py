@@ -153,7 +153,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         sources=_sources(videos),
         settings=settings.text(),
         notes=tuple(notes),
-        videos={camera: str(video.path.resolve()) for camera, video in videos.items()},
+        videos={camera: str(video.path.absolute()) for camera, video in videos.items()},
         lag={camera: np.where(shown < 0, 0.0, rig_times[camera][shown] - clock) for camera, shown in frame.items()},
         longest_gap=settings.fill,
     )
