@@ -7,7 +7,11 @@ const query = (parameters) => new URLSearchParams(parameters).toString();
 async function checked(answer) {
   if (answer.ok) return answer;
   let text = `the server answered ${answer.status}`;
-  try { text = (await answer.json()).error ?? text; } catch { /* no JSON */ }
+  try {
+    text = (await answer.json()).error ?? text;
+  } catch {
+    /* no JSON */
+  }
   throw new Error(text);
 }
 
@@ -45,7 +49,8 @@ export class Rows {
   fetch(index) {
     if (index < 0 || index * ROWS >= this.total) return Promise.resolve();
     if (!this.blocks.has(index)) {
-      const first = index * ROWS, count = Math.min(ROWS, this.total - first);
+      const first = index * ROWS,
+        count = Math.min(ROWS, this.total - first);
       const markers = this.markers;
       const loading = getArray("block", { name: this.name, first, count }).then((values) => {
         const block = parse(values, count, markers, this.cameras);
@@ -75,10 +80,22 @@ function parse(values, rows, markers, cameras) {
   let at = 0;
   const take = (count) => values.subarray(at, (at += count));
   const cells = rows * markers;
-  const block = { time: take(rows), state: take(cells), changed: take(cells), position: take(3 * cells), sigma: take(3 * cells), cameras: {} };
+  const block = {
+    time: take(rows),
+    state: take(cells),
+    changed: take(cells),
+    position: take(3 * cells),
+    sigma: take(3 * cells),
+    cameras: {},
+  };
   for (const camera of cameras) {
     block.cameras[camera] = {
-      frame: take(rows), damaged: take(rows), kind: take(cells), pixel: take(2 * cells), sigma: take(2 * cells), residual: take(cells),
+      frame: take(rows),
+      damaged: take(rows),
+      kind: take(cells),
+      pixel: take(2 * cells),
+      sigma: take(2 * cells),
+      residual: take(cells),
     };
   }
   return block;
@@ -97,7 +114,9 @@ export class Images {
     let found = this.kept.get(key);
     if (!found) {
       found = fetch(`/api/frame?${query({ name: this.name, camera, number })}`)
-        .then(checked).then((answer) => answer.blob()).then(createImageBitmap)
+        .then(checked)
+        .then((answer) => answer.blob())
+        .then(createImageBitmap)
         .catch((error) => ({ missing: error.message }));
     }
     this.kept.delete(key);

@@ -9,7 +9,8 @@ export async function showList() {
   const { folder, recordings } = await get("recordings");
   document.title = `${folder} - rafl-review`;
   document.querySelector("#folder").textContent = folder;
-  const body = document.querySelector("#rows"), filter = document.querySelector("#filter");
+  const body = document.querySelector("#rows"),
+    filter = document.querySelector("#filter");
   const waiting = new Map();
   let asking = false;
 
@@ -20,10 +21,16 @@ export async function showList() {
       while (waiting.size) {
         const part = [...waiting].slice(0, AT_ONCE);
         part.forEach(([name]) => waiting.delete(name));
-        const found = await post("summaries", {}, part.map(([name]) => name));
+        const found = await post(
+          "summaries",
+          {},
+          part.map(([name]) => name),
+        );
         for (const [name, row] of part) fill(row, found[name]);
       }
-    } finally { asking = false; }
+    } finally {
+      asking = false;
+    }
   }
 
   const observer = new IntersectionObserver((entries) => {
@@ -34,17 +41,19 @@ export async function showList() {
     }
     ask();
   });
-  body.replaceChildren(...recordings.map(({ name, corrected }) => {
-    const row = document.createElement("tr");
-    row.dataset.name = name;
-    for (let k = 0; k < 8; k++) row.append(document.createElement("td"));
-    const link = document.createElement("a");
-    link.href = `#/recording/${encodeURIComponent(name)}`;
-    link.textContent = name;
-    row.cells[0].append(link);
-    row.cells[7].textContent = corrected ? "yes" : "";
-    return row;
-  }));
+  body.replaceChildren(
+    ...recordings.map(({ name, corrected }) => {
+      const row = document.createElement("tr");
+      row.dataset.name = name;
+      for (let k = 0; k < 8; k++) row.append(document.createElement("td"));
+      const link = document.createElement("a");
+      link.href = `#/recording/${encodeURIComponent(name)}`;
+      link.textContent = name;
+      row.cells[0].append(link);
+      row.cells[7].textContent = corrected ? "yes" : "";
+      return row;
+    }),
+  );
   for (const row of body.rows) observer.observe(row);
   const apply = () => {
     const text = filter.value.toLowerCase();
@@ -63,6 +72,15 @@ function fill(row, found) {
     row.title = found.error;
     return;
   }
-  const texts = [found.frames, found.markers, found.cameras, percent(found.measured), percent(found.filled), percent(found.missing)];
-  texts.forEach((text, k) => { row.cells[k + 1].textContent = text; });
+  const texts = [
+    found.frames,
+    found.markers,
+    found.cameras,
+    percent(found.measured),
+    percent(found.filled),
+    percent(found.missing),
+  ];
+  texts.forEach((text, k) => {
+    row.cells[k + 1].textContent = text;
+  });
 }

@@ -9,25 +9,38 @@ function item(text, className = "") {
   return entry;
 }
 
-const SIZES = { jump: "px jump", residual: "px residual", sigma: "px sigma", missing: "frames missing", filled: "frames filled" };
+const SIZES = {
+  jump: "px jump",
+  residual: "px residual",
+  sigma: "px sigma",
+  missing: "frames missing",
+  filled: "frames filled",
+};
 
 export function showStretches(stretches, names, current, choose) {
   $("#count").textContent = stretches.length;
-  $("#stretches").replaceChildren(...stretches.map((stretch, index) => {
-    const size = stretch.kind === "missing" || stretch.kind === "filled" ? stretch.size : stretch.size.toFixed(stretch.size < 10 ? 2 : 0);
-    const where = stretch.first === stretch.last ? `${stretch.first}` : `${stretch.first} to ${stretch.last}`;
-    const who = stretch.other < 0 ? names[stretch.marker] : `${names[stretch.marker]} and ${names[stretch.other]} exchanged?`;
-    const text = `${who}: ${size} ${SIZES[stretch.kind]}, ${where}${stretch.camera ? `, ${stretch.camera}` : ""}`;
-    const entry = item(text, `${index === current ? "current" : ""} ${stretch.reviewed ? "reviewed" : ""}`);
-    entry.addEventListener("click", () => choose(index));
-    return entry;
-  }));
+  $("#stretches").replaceChildren(
+    ...stretches.map((stretch, index) => {
+      const size =
+        stretch.kind === "missing" || stretch.kind === "filled"
+          ? stretch.size
+          : stretch.size.toFixed(stretch.size < 10 ? 2 : 0);
+      const where = stretch.first === stretch.last ? `${stretch.first}` : `${stretch.first} to ${stretch.last}`;
+      const who =
+        stretch.other < 0 ? names[stretch.marker] : `${names[stretch.marker]} and ${names[stretch.other]} exchanged?`;
+      const text = `${who}: ${size} ${SIZES[stretch.kind]}, ${where}${stretch.camera ? `, ${stretch.camera}` : ""}`;
+      const entry = item(text, `${index === current ? "current" : ""} ${stretch.reviewed ? "reviewed" : ""}`);
+      entry.addEventListener("click", () => choose(index));
+      return entry;
+    }),
+  );
   $("#stretches .current")?.scrollIntoView({ block: "nearest" });
 }
 
 function described(entry) {
   const texts = {
-    place: () => `${entry.marker} ${{ fit: "fitted", hand: "set by hand", followed: "followed" }[entry.how]}, ${entry.frames} frame${entry.frames === 1 ? "" : "s"}`,
+    place: () =>
+      `${entry.marker} ${{ fit: "fitted", hand: "set by hand", followed: "followed" }[entry.how]}, ${entry.frames} frame${entry.frames === 1 ? "" : "s"}`,
     delete: () => `${entry.marker} deleted, ${entry.first} to ${entry.last}`,
     accept: () => `${entry.marker} accepted, ${entry.first} to ${entry.last}`,
     swap: () => `${entry.markers.join(" and ")} swapped from ${entry.first} on`,

@@ -3,11 +3,36 @@
 import uPlot from "/static/uPlot.esm.js";
 import { getArray } from "/static/api.js";
 
-const AXIS = { stroke: "#9aa4af", grid: { stroke: "#2c3137" }, ticks: { stroke: "#3a3f46" }, font: "11px system-ui", values: (_, ticks) => ticks.map((tick) => Number(tick.toPrecision(4))) };
+const AXIS = {
+  stroke: "#9aa4af",
+  grid: { stroke: "#2c3137" },
+  ticks: { stroke: "#3a3f46" },
+  font: "11px system-ui",
+  values: (_, ticks) => ticks.map((tick) => Number(tick.toPrecision(4))),
+};
 const PLOTS = [
-  { key: "path", share: 1.0, label: "path", series: [["x [mm]", "#ff8f6b"], ["y [mm]", "#5aff7a"], ["z [mm]", "#6bb8ff"], ["u [px]", "#d5a6ff"], ["v [px]", "#ffe36b"]] },
+  {
+    key: "path",
+    share: 1.0,
+    label: "path",
+    series: [
+      ["x [mm]", "#ff8f6b"],
+      ["y [mm]", "#5aff7a"],
+      ["z [mm]", "#6bb8ff"],
+      ["u [px]", "#d5a6ff"],
+      ["v [px]", "#ffe36b"],
+    ],
+  },
   { key: "residual", share: 0.5, label: "residual", series: [["residual [px]", "#ff8f6b"]] },
-  { key: "sigma", share: 0.5, label: "sigma", series: [["sigma [px]", "#6bb8ff"], ["sigma [mm]", "#5aff7a"]] },
+  {
+    key: "sigma",
+    share: 0.5,
+    label: "sigma",
+    series: [
+      ["sigma [px]", "#6bb8ff"],
+      ["sigma [mm]", "#5aff7a"],
+    ],
+  },
 ];
 const FROM_ZERO = { range: (plot, least, most) => [0, 1.1 * most || 1] };
 const LEGEND_PX = 28; // below each plot
@@ -19,9 +44,31 @@ export class Plots {
     this.x = Float64Array.from({ length: rows }, (_, row) => row);
     for (const { key, series } of PLOTS) {
       const options = {
-        ...this.size(key), scales: { x: { time: false, range: [0, Math.max(rows - 1, 1)] }, ...(key === "path" ? {} : { y: FROM_ZERO, second: FROM_ZERO }) }, legend: { live: false }, cursor: { drag: { x: false, y: false }, sync: { key: "row" }, points: { size: 4 } },
-        axes: [{ ...AXIS, size: 22, gap: 2 }, { ...AXIS, size: 52, space: 24 }, ...(key === "residual" ? [] : [{ ...AXIS, size: 52, side: 1, space: 24, scale: "second", grid: { show: false } }])],
-        series: [{}, ...series.map(([label, stroke]) => ({ label, stroke, width: 1.2, spanGaps: false, points: { show: false }, scale: this.scaleOf(key, label) }))],
+        ...this.size(key),
+        scales: {
+          x: { time: false, range: [0, Math.max(rows - 1, 1)] },
+          ...(key === "path" ? {} : { y: FROM_ZERO, second: FROM_ZERO }),
+        },
+        legend: { live: false },
+        cursor: { drag: { x: false, y: false }, sync: { key: "row" }, points: { size: 4 } },
+        axes: [
+          { ...AXIS, size: 22, gap: 2 },
+          { ...AXIS, size: 52, space: 24 },
+          ...(key === "residual"
+            ? []
+            : [{ ...AXIS, size: 52, side: 1, space: 24, scale: "second", grid: { show: false } }]),
+        ],
+        series: [
+          {},
+          ...series.map(([label, stroke]) => ({
+            label,
+            stroke,
+            width: 1.2,
+            spanGaps: false,
+            points: { show: false },
+            scale: this.scaleOf(key, label),
+          })),
+        ],
         hooks: { drawClear: [(plot) => this.drawBands(plot)], draw: [(plot) => this.drawLine(plot)] },
       };
       const box = document.createElement("div");
@@ -35,16 +82,22 @@ export class Plots {
     new ResizeObserver(() => this.plots.forEach((plot, k) => plot.setSize(this.size(PLOTS[k].key)))).observe(parent);
   }
 
-  scaleOf(key, label) { return (key === "path" && label.endsWith("[px]")) || (key === "sigma" && label.endsWith("[mm]")) ? "second" : "y"; }
+  scaleOf(key, label) {
+    return (key === "path" && label.endsWith("[px]")) || (key === "sigma" && label.endsWith("[mm]")) ? "second" : "y";
+  }
 
   size(key) {
     const { share } = PLOTS.find((plot) => plot.key === key);
-    return { width: Math.max(Math.floor(this.parent.clientWidth / 2) - 6, 200), height: Math.max(Math.round(share * this.parent.clientHeight) - LEGEND_PX, 50) };
+    return {
+      width: Math.max(Math.floor(this.parent.clientWidth / 2) - 6, 200),
+      height: Math.max(Math.round(share * this.parent.clientHeight) - LEGEND_PX, 50),
+    };
   }
 
   async load(name, marker, camera) {
     const values = await getArray("series", { name, marker, camera });
-    const column = (k) => Array.from(values.subarray(k * this.rows, (k + 1) * this.rows), (v) => (Number.isFinite(v) ? v : null));
+    const column = (k) =>
+      Array.from(values.subarray(k * this.rows, (k + 1) * this.rows), (v) => (Number.isFinite(v) ? v : null));
     const [x, y, z, sigmaMm, u, v, sigmaPx, residual, state] = Array.from({ length: 9 }, (_, k) => column(k));
     this.state = state;
     [[x, y, z, u, v], [residual], [sigmaPx, sigmaMm]].forEach((data, k) => this.plots[k].setData([this.x, ...data]));
@@ -62,7 +115,8 @@ export class Plots {
       let end = row + 1;
       while (end < this.rows && this.state[end] === this.state[row]) end++;
       if (BANDS[this.state[row]]) {
-        const from = Math.max(plot.valToPos(row - 0.5, "x", true), left), to = Math.min(plot.valToPos(end - 0.5, "x", true), left + width);
+        const from = Math.max(plot.valToPos(row - 0.5, "x", true), left),
+          to = Math.min(plot.valToPos(end - 0.5, "x", true), left + width);
         plot.ctx.fillStyle = BANDS[this.state[row]];
         if (to > from) plot.ctx.fillRect(from, top, Math.max(to - from, 1), height);
       }
@@ -78,7 +132,8 @@ export class Plots {
       plot.ctx.fillText("no other camera sees this marker", plot.bbox.left + 10, plot.bbox.top + plot.bbox.height / 2);
       plot.ctx.restore();
     }
-    const { top, height, left, width } = plot.bbox, x = plot.valToPos(this.row, "x", true);
+    const { top, height, left, width } = plot.bbox,
+      x = plot.valToPos(this.row, "x", true);
     if (x < left || x > left + width) return;
     plot.ctx.fillStyle = "#fffc";
     plot.ctx.fillRect(x - 0.5, top, 1.5, height);

@@ -11,7 +11,20 @@ const $ = (selector) => document.querySelector(selector);
 
 export class Recording {
   constructor(name) {
-    Object.assign(this, { name, row: 0, selected: [], camera: "", stretches: [], current: -1, writable: false, adding: false, going: Promise.resolve(), stopped: false, wanted: 0, busy: Promise.resolve() });
+    Object.assign(this, {
+      name,
+      row: 0,
+      selected: [],
+      camera: "",
+      stretches: [],
+      current: -1,
+      writable: false,
+      adding: false,
+      going: Promise.resolve(),
+      stopped: false,
+      wanted: 0,
+      busy: Promise.resolve(),
+    });
     this.listening = new AbortController();
   }
 
@@ -70,14 +83,21 @@ export class Recording {
 
   showWarning() {
     const reasons = [this.warning];
-    if (!this.writable && !this.warning) reasons.push("Another page has this recording open: it can be looked at here, and corrected once that page is closed.");
-    if (!this.state.has_calibration) reasons.push("The tracks hold no cameras, so nothing can be corrected; track again.");
+    if (!this.writable && !this.warning)
+      reasons.push(
+        "Another page has this recording open: it can be looked at here, and corrected once that page is closed.",
+      );
+    if (!this.state.has_calibration)
+      reasons.push("The tracks hold no cameras, so nothing can be corrected; track again.");
     reasons.push(...this.state.unfit);
     const text = reasons.filter(Boolean).join(" ");
     $("#warning").textContent = text;
     $("#warning").hidden = !text;
     document.body.dataset.writable = String(this.writable);
-    for (const button of document.querySelectorAll("[data-do]:not([data-do=earlier]):not([data-do=later]), #undo, #redo")) button.disabled = !this.writable;
+    for (const button of document.querySelectorAll(
+      "[data-do]:not([data-do=earlier]):not([data-do=later]), #undo, #redo",
+    ))
+      button.disabled = !this.writable;
     if (this.writable) {
       $("#undo").disabled = !this.state.corrections.length;
       $("#redo").disabled = !this.state.redo;
@@ -92,7 +112,9 @@ export class Recording {
     const found = this.data.at(row);
     if (!found || ticket !== this.wanted) return;
     const numbers = this.views.map((view) => found.block.cameras[view.camera].frame[found.at]);
-    const images = await Promise.all(this.views.map((view, k) => (numbers[k] < 0 ? null : this.images.get(view.camera, numbers[k]))));
+    const images = await Promise.all(
+      this.views.map((view, k) => (numbers[k] < 0 ? null : this.images.get(view.camera, numbers[k]))),
+    );
     if (ticket !== this.wanted || this.stopped) return;
     this.row = row;
     this.views.forEach((view, k) => view.show(images[k], this.data, row, this.state.names, this.selected));
@@ -101,14 +123,23 @@ export class Recording {
     $("#time").textContent = `${found.block.time[found.at].toFixed(3)} s`;
     document.body.dataset.row = row;
     this.views.forEach((view, k) => {
-      for (let ahead = 1; ahead <= PREFETCHED && numbers[k] >= 0 && row + ahead < this.state.rows; ahead++) this.images.get(view.camera, numbers[k] + ahead);
+      for (let ahead = 1; ahead <= PREFETCHED && numbers[k] >= 0 && row + ahead < this.state.rows; ahead++)
+        this.images.get(view.camera, numbers[k] + ahead);
     });
   }
 
-  redraw() { for (const view of this.views) { view.selected = this.selected; view.draw(); } }
+  redraw() {
+    for (const view of this.views) {
+      view.selected = this.selected;
+      view.draw();
+    }
+  }
 
   activate(camera) {
-    if (camera !== this.camera && this.plots) { this.camera = camera; this.plotMarker(); }
+    if (camera !== this.camera && this.plots) {
+      this.camera = camera;
+      this.plotMarker();
+    }
     this.camera = camera;
     for (const view of this.views) view.box.classList.toggle("active", view.camera === camera);
   }
@@ -123,7 +154,11 @@ export class Recording {
     this.plotMarker();
   }
 
-  plotMarker() { return this.plots.load(this.name, this.selected.at(-1) ?? 0, this.camera).catch((error) => this.say(error.message, true)); }
+  plotMarker() {
+    return this.plots
+      .load(this.name, this.selected.at(-1) ?? 0, this.camera)
+      .catch((error) => this.say(error.message, true));
+  }
 
   say(text, bad = false) {
     $("#message").textContent = text;
@@ -153,7 +188,9 @@ export class Recording {
     }
   }
 
-  async reload() { await this.take(await get("recording", { name: this.name })); }
+  async reload() {
+    await this.take(await get("recording", { name: this.name }));
+  }
 
   async take(state) {
     Object.assign(this.state, state);
@@ -170,7 +207,9 @@ export class Recording {
     showCorrections(this.state);
     showNotes(this.state.notes);
     this.showWarning();
-    $("#names").replaceChildren(...this.state.names.map((name) => Object.assign(document.createElement("option"), { value: name })));
+    $("#names").replaceChildren(
+      ...this.state.names.map((name) => Object.assign(document.createElement("option"), { value: name })),
+    );
   }
 
   async loadStretches() {
@@ -179,12 +218,22 @@ export class Recording {
     if (revision !== this.state.revision) return;
     this.stretches = found.filter((item) => !item.reviewed || $("#all").checked);
     const before = this.chosen;
-    this.current = before ? this.stretches.findIndex((item) => item.kind === before.kind && item.marker === before.marker && item.camera === before.camera && item.first === before.first) : -1;
+    this.current = before
+      ? this.stretches.findIndex(
+          (item) =>
+            item.kind === before.kind &&
+            item.marker === before.marker &&
+            item.camera === before.camera &&
+            item.first === before.first,
+        )
+      : -1;
     if (this.current < 0 && before) this.current = Math.min(this.position, this.stretches.length) - 0.5; // between two: it is gone
     this.listStretches();
   }
 
-  listStretches() { showStretches(this.stretches, this.state.names, this.current, (index) => this.goTo(index)); }
+  listStretches() {
+    showStretches(this.stretches, this.state.names, this.current, (index) => this.goTo(index));
+  }
 
   goTo(index) {
     if (!this.stretches.length) return this.say("Nothing is left to look at.");
@@ -221,10 +270,18 @@ export class Recording {
       if (what === "later") this.goTo(Math.floor(this.current) + 1);
       else if (what === "earlier") this.goTo(Math.ceil(this.current) - 1);
       else if (what === "swap") {
-        if (this.selected.length !== 2) throw new Error("Click on a marker, and with Shift on a second one, to swap them.");
+        if (this.selected.length !== 2)
+          throw new Error("Click on a marker, and with Shift on a second one, to swap them.");
         const [marker, other] = this.selected.map((index) => this.state.names[index]);
         await this.act({ kind: "swap", camera, marker, other });
-      } else if (what === "delete") await this.act({ kind: "delete", camera, marker: this.marker(), ...this.stretch(), all_cameras: $("#everywhere").checked });
+      } else if (what === "delete")
+        await this.act({
+          kind: "delete",
+          camera,
+          marker: this.marker(),
+          ...this.stretch(),
+          all_cameras: $("#everywhere").checked,
+        });
       else if (what === "accept") {
         await this.act({ kind: "accept", camera, marker: this.marker(), ...this.stretch() });
       } else if (what === "rename") {
@@ -243,9 +300,18 @@ export class Recording {
 
   // A marker that was lost is followed on from where it is put back.
   async move(camera, marker, x, y, hand) {
-    const name = this.state.names[marker], { block, at } = this.data.at(this.row);
+    const name = this.state.names[marker],
+      { block, at } = this.data.at(this.row);
     const lost = block.cameras[camera].kind[at * this.state.names.length + marker] !== 1;
-    const answer = await this.act({ kind: "place", camera, marker: name, x, y, hand, sigma: Number($("#sigma").value) || 1 });
+    const answer = await this.act({
+      kind: "place",
+      camera,
+      marker: name,
+      x,
+      y,
+      hand,
+      sigma: Number($("#sigma").value) || 1,
+    });
     if (answer && lost && !hand) await this.follow(camera, name);
   }
 
@@ -284,10 +350,17 @@ export class Recording {
 
   listen() {
     const on = (target, kind, call) => target.addEventListener(kind, call, { signal: this.listening.signal });
-    for (const button of document.querySelectorAll("[data-do]")) on(button, "click", () => { button.blur(); this.do(button.dataset.do); });
+    for (const button of document.querySelectorAll("[data-do]"))
+      on(button, "click", () => {
+        button.blur();
+        this.do(button.dataset.do);
+      });
     on($("#previous"), "click", () => this.show(this.row - 1));
     on($("#next"), "click", () => this.show(this.row + 1));
-    on($("#play"), "click", () => { $("#play").blur(); this.play(); });
+    on($("#play"), "click", () => {
+      $("#play").blur();
+      this.play();
+    });
     on($("#undo"), "click", () => this.do("undo"));
     on($("#redo"), "click", () => this.do("redo"));
     on($("#help"), "click", () => $("#keys").showModal());
@@ -300,14 +373,34 @@ export class Recording {
     if (event.target.matches("input, dialog *") || event.altKey || event.metaKey) return;
     const step = event.shiftKey ? 10 : 1;
     const keys = {
-      ArrowLeft: () => this.show(this.row - step), ArrowRight: () => this.show(this.row + step),
-      Home: () => this.show(0), End: () => this.show(this.state.rows - 1), " ": () => this.play(),
-      n: () => this.do("later"), p: () => this.do("earlier"), s: () => this.do("swap"), d: () => this.do("delete"),
-      f: () => this.do("follow"), a: () => this.do("add"), Enter: () => this.do("accept"),
-      "[": () => { $("#from").value = this.row; }, "]": () => { $("#to").value = this.row; },
+      ArrowLeft: () => this.show(this.row - step),
+      ArrowRight: () => this.show(this.row + step),
+      Home: () => this.show(0),
+      End: () => this.show(this.state.rows - 1),
+      " ": () => this.play(),
+      n: () => this.do("later"),
+      p: () => this.do("earlier"),
+      s: () => this.do("swap"),
+      d: () => this.do("delete"),
+      f: () => this.do("follow"),
+      a: () => this.do("add"),
+      Enter: () => this.do("accept"),
+      "[": () => {
+        $("#from").value = this.row;
+      },
+      "]": () => {
+        $("#to").value = this.row;
+      },
       0: () => this.views.forEach((view) => view.whole()),
-      e: () => { for (const view of this.views) view.ellipse = (view.ellipse + 1) % 3; this.redraw(); },
-      "?": () => $("#keys").showModal(), Escape: () => { this.adding = this.following = false; this.say(""); },
+      e: () => {
+        for (const view of this.views) view.ellipse = (view.ellipse + 1) % 3;
+        this.redraw();
+      },
+      "?": () => $("#keys").showModal(),
+      Escape: () => {
+        this.adding = this.following = false;
+        this.say("");
+      },
     };
     const withControl = { z: () => this.do("undo"), y: () => this.do("redo") };
     const call = event.ctrlKey ? withControl[event.key] : keys[event.key];
