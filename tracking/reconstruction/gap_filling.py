@@ -87,6 +87,8 @@ def refill_gaps(
         last = np.flatnonzero(~padded[:-1] & padded[1:])
         for begin, end in zip(first.tolist(), last.tolist(), strict=True):
             anew[begin:end, marker] = changed[max(begin - 1, 0) : end + 1, marker].any()
+    if not anew.any():
+        return position, sigma, state
     known = np.where(measured[..., None], position, np.nan)
     filled, grown, new = fill_gaps(known, sigma, time, longest, anew)
     kept = ~(anew | measured)[..., None]
