@@ -7,6 +7,7 @@ from pathlib import Path
 import av
 import numpy as np
 from scipy.spatial.transform import Rotation
+from synthetic import Scene, draw, expose
 
 from rafl.calibration.camera import OrthographicCamera
 from rafl.calibration.rig import Rig
@@ -14,7 +15,6 @@ from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.pipeline import TrackingSettings, track_recording
 from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
-from rafl.tracking.synthetic import Scene, draw, expose
 from rafl.tracking.video.recordings import open_videos
 
 SIZE = (400, 320)

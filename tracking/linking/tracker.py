@@ -36,8 +36,8 @@ Array = NDArray[Any]
 MAX_RELIABLE_ERROR = 0.22  # prediction error up to which the dot at a predicted position is that marker's [spacings]
 MAX_CONFIRMED_ERROR = 0.1  # the same where some markers are not at their predicted positions [spacings]
 PREDICTION_GATE = 0.33  # most distance of a marker's own dot from its predicted position [spacings]
-# Standard deviation of the predicted positions, which all markers have in common [spacings]. The error so far says little
-# about the next frame, in which a body may be hit. Before any motion is known most bodies are near rest.
+# Standard deviation of the predicted positions, common to all markers [spacings]. The error so far says little
+# about the next frame, in which a body may be hit. Before any motion is known, most bodies are near rest.
 MOTION_SIGMA, FIRST_MOTION_SIGMA = 0.2, 0.15
 SEARCH_SIGMAS = 3.0  # dots are searched within this many sigmas of the markers' expected positions
 STATIC_SIGMA = 0.03  # of a static dot's position about its first one [spacings]
