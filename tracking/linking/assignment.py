@@ -31,7 +31,8 @@ class AssignmentSettings:
         clutter_side: side of the square that holds one false detection on average [spacings]. Twice as much accepts a
             dot that is 0.4 sigma farther away.
         log_margin: a hypothesis is as good as the best one if its logarithm of the likelihood ratio is at most this
-            much smaller. Eight are odds of 3,000 to 1; half as much makes mistakes in hidden parts of the body.
+            much smaller. Five are odds of 150 to 1. With eight, up to six times as many markers of a body that moves
+            by a spacing a frame stay without a dot.
         gate: most distance of a pair that starts a hypothesis [standard deviations]. It limits time only.
         most_starts: pairs tried as starts, likeliest first. It limits time only.
         unmoved: a dot this near to a marker's last position may be a static one [spacings]: ten times the error of a
