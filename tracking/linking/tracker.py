@@ -46,7 +46,7 @@ MAX_EXTRAPOLATED_FRAMES = 3  # for which a hidden marker's own motion still pred
 SIGMA_GROWTH = 1.5  # factor per frame on the sigma of a hidden marker's predicted position
 # A dot with a larger misfit [share of the contrast] is fitted again from the median disc, in a marker's first frames.
 MAX_YOUNG_MISFIT, YOUNG_FRAMES = 0.1, 8
-# After a total loss, so many of the shapes seen so far are tried, each with errors of this sigma [spacings].
+# If most markers are missing, so many of the shapes seen so far are tried, each with errors of this sigma [spacings].
 MAX_RECALLED_SHAPES, RECALLED_SIGMA = 16, 0.2
 SEARCH_INTERVAL = 4  # frames between searches for hidden markers
 
@@ -83,12 +83,16 @@ class Tracker:
         none_lost = bool(visible.any() and shown[visible].all())
         if not none_lost or (shown & ~visible).any() or self.frames_since_search >= self._interval():
             reliable = none_lost or self.motion.errors.min() < MAX_CONFIRMED_ERROR
-            found = self._search(image, self._beliefs(belief), _restrict(dots, visible & reliable))
+            own, body = _restrict(dots, visible & reliable), ~self.static_dots.mask
+            lost = (self.frames_missing[body] > MAX_EXTRAPOLATED_FRAMES).all()
+            found = own if lost else self._search(image, [belief], own)
             separation = MIN_SEPARATION_RADII * self.appearance.radius
             same = shown & (np.linalg.norm(found.centre - dots.centre, axis=1) < separation)
             rows = np.flatnonzero(same & np.isfinite(found.sigma[:, 0]))
             dots = _replace_rows(found, rows, dots[rows])  # fits that start from the marker's own disc are better
             self.frames_since_search = 0
+            if not self._mostly_seen(dots):
+                dots = self._recall(image, dots)
         dots = _restrict(dots, dots.within(image))
         self._update(dots)
         return dots
@@ -143,13 +147,24 @@ class Tracker:
         own = self._visible_on_body()
         return Belief(np.where(own[:, None], positions, belief.position), belief.covariance)
 
-    def _beliefs(self, belief: Belief) -> list[Belief]:
-        """The beliefs among which a search decides: the present one, or those about known shapes after a total loss."""
+    def _mostly_seen(self, dots: Dots) -> bool:
+        """Whether the dots show at least half of the markers on the body."""
         body = ~self.static_dots.mask
-        if self.frames_missing[body].min(initial=0) <= MAX_EXTRAPOLATED_FRAMES:
-            return [belief]
-        sigma = 0.17 * self.pattern.spacing
-        return [self._predict_from(shape, sigma) for shape in self.prior.sample_shapes(MAX_RECALLED_SHAPES)]
+        return bool(2 * np.isfinite(dots.sigma[body, 0]).sum() >= body.sum())
+
+    def _recall(self, image: Array, dots: Dots) -> Dots:
+        """The dots of a body in one of the shapes seen so far, if they show most of it; else the given dots.
+
+        Most of the body may be hidden, or the identities lost or wrong. The dots do not tell which until half of them
+        are there again.
+        """
+        sigma = RECALLED_SIGMA * self.pattern.spacing
+        beliefs = [self._predict_from(shape, sigma) for shape in self.prior.sample_shapes(MAX_RECALLED_SHAPES)]
+        found = self._search(image, beliefs, Dots.missing(len(dots)))
+        if not self._mostly_seen(found):
+            return dots
+        self.frames_missing[:] = np.maximum(self.frames_missing, 1)  # their motion so far may be that of others
+        return found
 
     def _visible_on_body(self) -> NDArray[np.bool_]:
         """The markers on the body that were visible in the frame before, (M)."""
