@@ -92,6 +92,8 @@ def _frame(recording: OpenRecording, camera: str, row: int) -> int:
 
 def _frames(recording: OpenRecording, camera: str, row: int, last_row: int) -> tuple[int, int]:
     """First and last frame of a camera in rows `row` to `last_row`."""
+    if camera not in recording.tracks.frame:
+        raise InputError(f"expected a camera of the tracks, found {camera!r:.80}")
     shown = recording.tracks.frame[camera][row : max(last_row, row) + 1]
     if not (shown >= 0).any():
         raise InputError(f"camera {camera} shows no frame at this time")

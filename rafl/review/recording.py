@@ -135,7 +135,9 @@ class OpenRecording:
         if not self.corrections:
             return False
         moment = self.corrections[-1].at
-        first = next(number for number, entry in enumerate(self.corrections) if entry.at == moment)
+        first = len(self.corrections)
+        while first and self.corrections[first - 1].at == moment:
+            first -= 1
         taken = self.corrections[first:]
         self._replace(self.corrections[:first], 0)
         self.undone.append(taken)
@@ -152,9 +154,8 @@ class OpenRecording:
 
     def _replace(self, corrections: tuple[Correction, ...], new: int) -> None:
         """Write the corrections, of which the last `new` must fit the tracks, and apply them."""
-        on_disk = self.beside.read_bytes() if self.beside.exists() else None
-        if on_disk != self.text:
-            raise InputError(f"{self.beside.name} was changed by another program; load the page again")
+        if self.is_changed():
+            raise InputError(f"{self.path.stem} was tracked or corrected by another program; load the page again")
         found = apply_corrections(self.raw, corrections, self.path, self.found)
         rejected = [line for line in found.unfit if line not in self.found.unfit]
         if new and rejected:

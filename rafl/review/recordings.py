@@ -2,7 +2,9 @@
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from pathlib import Path
+from typing import TypeVar
 
 import h5py
 import numpy as np
@@ -16,6 +18,8 @@ from rafl.tracking.reconstruction.corrections import corrections_path
 from rafl.tracking.reconstruction.gap_filling import FILLED, MEASURED, MISSING
 from rafl.tracking.reconstruction.tracks import LABEL, Tracks
 from rafl.tracking.video.reader import Video, is_video, open_video
+
+Result = TypeVar("Result")
 
 MAX_OPEN = 3  # recordings whose tracks and frames are kept in memory
 
@@ -32,7 +36,7 @@ class Library:
     def __init__(self, folder: Path, videos: Path | None, who: str) -> None:
         self.folder, self.videos, self.who = folder, videos, who
         self.opened: OrderedDict[str, OpenRecording] = OrderedDict()
-        self.opening = threading.Lock()
+        self.opening, self.reading = threading.Lock(), threading.Lock()
         self.digests: dict[tuple[str, int, int], str] = {}
 
     def names(self) -> list[str]:
@@ -64,17 +68,19 @@ class Library:
             InputError: the file cannot be read.
         """
         path = self.path(name)
-        with read_hdf5(path, LABEL, "track again") as file:
-            states = file["state"]
-            if not isinstance(states, h5py.Dataset):
-                raise ValueError("state: expected an array, found a group")
-            state = np.asarray(states[()])
-            cameras = len(file.get("cameras", {}))
-        shares = {
-            word: float((state == value).mean()) if state.size else 0.0
-            for word, value in (("measured", MEASURED), ("filled", FILLED), ("missing", MISSING))
-        }
-        return {"frames": state.shape[0], "markers": state.shape[1], "cameras": cameras} | shares
+        return self._read(lambda: _summary(path))
+
+    def _read(self, reading: Callable[[], Result]) -> Result:
+        """What reading a tracks file gives. One thread reads at a time, and no error keeps objects of h5py alive.
+
+        Without that h5py stops for good when a thread frees such an object while another one reads.
+        """
+        with self.reading:
+            try:
+                return reading()
+            except InputError as error:
+                message = str(error)
+        raise InputError(message)
 
     def has_corrections(self, name: str) -> bool:
         """Whether there is a file of corrections."""
@@ -94,7 +100,7 @@ class Library:
                 return known
             if known is not None:
                 self.opened.pop(name).close()
-            found = OpenRecording(path, self.who, self._find_video)
+            found = self._read(lambda: OpenRecording(path, self.who, self._find_video))
             self.opened[name] = found
             while len(self.opened) > MAX_OPEN:
                 self.opened.popitem(last=False)[1].close()
@@ -133,6 +139,23 @@ class Library:
         if key not in self.digests:
             self.digests[key] = sha256(path)
         return self.digests[key]
+
+
+def _summary(path: Path) -> dict[str, object]:
+    """See `Library.summary`."""
+    with read_hdf5(path, LABEL, "track again") as file:
+        states = file["state"]
+        if not isinstance(states, h5py.Dataset):
+            raise ValueError("state: expected an array, found a group")
+        if states.ndim != 2:
+            raise ValueError(f"state: expected an array of frames and markers, found {states.ndim} dimensions")
+        state = np.asarray(states[()])
+        cameras = len(file.get("cameras", {}))
+    shares = {
+        word: float((state == value).mean()) if state.size else 0.0
+        for word, value in (("measured", MEASURED), ("filled", FILLED), ("missing", MISSING))
+    }
+    return {"frames": state.shape[0], "markers": state.shape[1], "cameras": cameras} | shares
 
 
 def _named_videos(folder: Path, recording: str, camera: str) -> list[Path]:

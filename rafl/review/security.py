@@ -23,6 +23,7 @@ HEADERS = {
 }
 LOCAL_NAMES = ("127.0.0.1", "localhost")
 MAX_BODY_BYTES = 100_000
+HTTP_PORT = 80
 
 
 class Guard:
@@ -34,6 +35,8 @@ class Guard:
     def __init__(self, app: ASGIApp, token: str, port: int) -> None:
         self.app, self.token = app, token
         self.hosts = {f"{name}:{port}" for name in LOCAL_NAMES}
+        if port == HTTP_PORT:  # which browsers leave out
+            self.hosts.update(LOCAL_NAMES)
         self.cookie = f"rafl-review-{port}"
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -63,7 +66,7 @@ class Guard:
 
     def _foreign(self, headers: Headers) -> str:
         """Why a request comes from elsewhere; empty if it does not."""
-        if headers.get("host", "") not in self.hosts:
+        if headers.get("host", "").lower() not in self.hosts:
             return "expected a request to this machine"
         origin = headers.get("origin")
         if origin is not None and origin.removeprefix("http://") not in self.hosts:

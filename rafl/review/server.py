@@ -6,6 +6,7 @@ from importlib.resources import files
 from typing import Annotated, Any
 
 from fastapi import Body, FastAPI, HTTPException, Request, Response
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
 from starlette.types import ASGIApp
 
@@ -48,6 +49,15 @@ def create_server(library: Library, token: str, port: int, ready: Callable[[], A
     @app.exception_handler(InputError)
     async def refuse(request: Request, error: InputError) -> JSONResponse:
         return JSONResponse({"error": str(error)}, 422)
+
+    @app.exception_handler(RequestValidationError)
+    async def refuse_request(request: Request, error: RequestValidationError) -> JSONResponse:
+        first = error.errors()[0]
+        return JSONResponse({"error": f"{first['loc'][-1]}: {first['msg'][0].lower()}{first['msg'][1:]}"}, 422)
+
+    @app.exception_handler(UnicodeDecodeError)
+    async def refuse_text(request: Request, error: UnicodeDecodeError) -> JSONResponse:
+        return JSONResponse({"error": "expected UTF-8"}, 422)
 
     @app.exception_handler(ReadOnlyError)
     async def refuse_second(request: Request, error: ReadOnlyError) -> JSONResponse:

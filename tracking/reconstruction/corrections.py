@@ -190,7 +190,7 @@ _Dumper.add_representer(str, _represent_text)
 def _entry_text(correction: Correction) -> str:
     values = correction.model_dump(exclude_defaults=True)
     entry: dict[str, Any] = {"kind": correction.kind} | {
-        key: value.isoformat(timespec="seconds")
+        key: value.isoformat(timespec="milliseconds")
         if isinstance(value, datetime)
         else list(value)
         if isinstance(value, tuple)

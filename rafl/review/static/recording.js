@@ -33,14 +33,18 @@ export class Recording {
     $("#warning").hidden = true;
     $("#message").textContent = "";
     document.title = `${this.name} - rafl-review`;
+    // Nothing of another recording stays, also if this one cannot be read.
+    $("#cameras").replaceChildren();
+    $("#plots").replaceChildren();
+    this.clearStretch();
+    for (const button of document.querySelectorAll("[data-do], #undo, #redo")) button.disabled = true;
     this.state = await get("recording", { name: this.name });
     const cameras = this.state.cameras.map(({ name }) => name);
     this.camera = cameras[0] ?? "";
     this.data = new Rows(this.name, cameras, this.state.rows);
     this.data.reset(this.state.names.length);
     this.images = new Images(this.name);
-    $("#cameras").replaceChildren();
-    $("#plots").replaceChildren();
+    for (const button of document.querySelectorAll("[data-do]")) button.disabled = false;
     const calls = {
       select: (marker, more) => this.select(marker, more),
       move: (camera, marker, x, y, hand) => this.move(camera, marker, x, y, hand),
@@ -116,6 +120,8 @@ export class Recording {
       this.views.map((view, k) => (numbers[k] < 0 ? null : this.images.get(view.camera, numbers[k]))),
     );
     if (ticket !== this.wanted || this.stopped) return;
+    const [from, to] = ["#from", "#to"].map((field) => $(field).value);
+    if (from !== "" && to !== "" && (row < Number(from) || row > Number(to))) this.clearStretch();
     this.row = row;
     this.views.forEach((view, k) => view.show(images[k], this.data, row, this.state.names, this.selected));
     this.plots.show(row);
@@ -145,6 +151,7 @@ export class Recording {
   }
 
   select(marker, more) {
+    this.clearStretch();
     if (marker < 0) this.selected = more ? this.selected : [];
     else if (more) this.selected = [...this.selected.filter((other) => other !== marker), marker].slice(-2);
     else this.selected = [marker];
@@ -167,7 +174,8 @@ export class Recording {
 
   // Do what the server calls an action, one after the other, and show what it changed.
   act(action) {
-    this.busy = this.busy.then(() => this.perform(action));
+    const meant = { row: this.row, ...action }; // what is shown now, not when its turn comes
+    this.busy = this.busy.then(() => this.perform(meant));
     return this.busy;
   }
 
@@ -176,7 +184,7 @@ export class Recording {
     document.body.dataset.acting = "yes";
     this.acting = true;
     try {
-      const answer = await post("correct", { name: this.name, page }, { row: this.row, ...action });
+      const answer = await post("correct", { name: this.name, page }, action);
       this.say(answer.message);
       await this.take(answer);
       return answer;
@@ -242,14 +250,19 @@ export class Recording {
     this.current = this.position = index;
     this.chosen = item;
     this.listStretches();
-    $("#from").value = item.first;
-    $("#to").value = item.last;
     if (item.camera) this.activate(item.camera);
     const row = item.kind === "jump" ? item.last : item.first; // of a jump, the first frame with the wrong dot
     this.going = this.show(row).then(() => {
       this.select(item.marker, false);
       if (item.other >= 0) this.select(item.other, true);
+      $("#from").value = item.first;
+      $("#to").value = item.last;
     });
+  }
+
+  // A stretch belongs to the marker and the place for which it was chosen.
+  clearStretch() {
+    $("#from").value = $("#to").value = "";
   }
 
   stretch() {
@@ -301,7 +314,8 @@ export class Recording {
   // A marker that was lost is followed on from where it is put back.
   async move(camera, marker, x, y, hand) {
     const name = this.state.names[marker],
-      { block, at } = this.data.at(this.row);
+      row = this.row,
+      { block, at } = this.data.at(row);
     const lost = block.cameras[camera].kind[at * this.state.names.length + marker] !== 1;
     const answer = await this.act({
       kind: "place",
@@ -312,21 +326,22 @@ export class Recording {
       hand,
       sigma: Number($("#sigma").value) || 1,
     });
-    if (answer && lost && !hand) await this.follow(camera, name);
+    if (answer && lost && !hand) await this.follow(camera, name, row);
   }
 
   async add(camera, x, y) {
     const marker = this.adding;
     this.adding = false;
-    const isNew = !this.state.names.includes(marker);
+    const isNew = !this.state.names.includes(marker),
+      row = this.row;
     const answer = await this.act({ kind: "place", camera, marker, x, y, new: isNew });
     if (!answer) return;
+    $("#name").value = "";
     this.select(this.state.names.indexOf(marker), false);
-    await this.follow(camera, marker);
+    await this.follow(camera, marker, row);
   }
 
-  async follow(camera, marker) {
-    const first = this.row;
+  async follow(camera, marker, first = this.row) {
     this.following = true;
     for (let row = first; this.following;) {
       const answer = await this.act({ kind: "follow", camera, marker, row });
