@@ -1,6 +1,7 @@
 """The server's calls without a browser: frames, corrections, and who is refused."""
 
 import json
+import os
 import shutil
 import time
 from dataclasses import replace
@@ -16,6 +17,7 @@ from starlette.testclient import TestClient
 from rafl.review.recordings import Library
 from rafl.review.server import create_server
 from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
+from rafl.tracking.reconstruction.corrections import corrections_path, read_corrections
 from rafl.tracking.reconstruction.tracks import read_tracks, write_tracks
 
 PORT, TOKEN = 4321, "token-of-the-tests"
@@ -239,9 +241,44 @@ def test_another_program_that_writes_the_file_is_noticed(client: TestClient, fil
     correct(client, kind="accept", camera="left", marker="A1", row=3, last_row=5)
     path = film.path.parent / "swing.corrections.yaml"
     path.write_text(path.read_text().replace("Ann", "Bob"))
-    assert "changed by another program" in refused(client, kind="undo")
+    assert "by another program" in refused(client, kind="undo")
     assert client.get("/api/recording", params=NAME).json()["corrections"][0]["by"] == "Bob"
     correct(client, kind="undo")
+
+
+def test_corrections_are_taken_back_one_by_one_after_a_restart(client: TestClient, film: Film) -> None:
+    for row in (3, 5, 7):
+        correct(client, kind="accept", camera="left", marker="A1", row=row, last_row=row)
+    path = corrections_path(film.path)
+    assert len({entry.at for entry in read_corrections(path)}) == 3
+    for left in (2, 1, 0):
+        path.touch()
+        Library(film.path.parent, None, "Ann").open("swing").undo()
+        assert len(read_corrections(path) if path.exists() else ()) == left
+
+
+def test_tracks_that_are_made_anew_are_noticed(client: TestClient, film: Film) -> None:
+    correct(client, kind="accept", camera="left", marker="A1", row=3, last_row=5)
+    os.utime(film.path, ns=(1, 1))
+    assert "by another program" in refused(client, kind="undo")
+
+
+def test_odd_requests_are_refused(client: TestClient, film: Film) -> None:
+    assert "x" in refused(client, kind="place", camera="left", marker="A1", x="NaN")
+    assert "camera" in refused(client, kind="delete", camera="nope", marker="A1", row=3)
+    answer = client.post("/api/correct", params=PAGE, content=b"\xff\xfe", headers={"content-type": "application/json"})
+    assert answer.status_code in (400, 422)
+
+
+def test_a_damaged_file_leaves_the_others_in_the_list(client: TestClient, film: Film) -> None:
+    damaged = film.path.with_name("flat.h5")
+    shutil.copy(film.path, damaged)
+    with h5py.File(damaged, "a") as file:
+        del file["state"]
+        file["state"] = np.zeros(5, np.uint8)
+    found = client.post("/api/summaries", json=["flat", "swing"]).json()
+    assert "state" in found["flat"]["error"]
+    assert found["swing"]["frames"] == 80
 
 
 def test_tracks_of_earlier_programs(client: TestClient, film: Film, tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ export class Recording {
     Object.assign(this, {
       name,
       row: 0,
+      asked: 0, // the row that will be shown
       selected: [],
       camera: "",
       stretches: [],
@@ -111,6 +112,7 @@ export class Recording {
   // Show a row: all cameras at once, when their frames are there. The last row asked for wins.
   async show(row) {
     row = Math.min(Math.max(Math.round(row), 0), this.state.rows - 1);
+    this.asked = row;
     const ticket = ++this.wanted;
     await this.data.load(row);
     const found = this.data.at(row);
@@ -388,8 +390,8 @@ export class Recording {
     if (event.target.matches("input, dialog *") || event.altKey || event.metaKey) return;
     const step = event.shiftKey ? 10 : 1;
     const keys = {
-      ArrowLeft: () => this.show(this.row - step),
-      ArrowRight: () => this.show(this.row + step),
+      ArrowLeft: () => this.show(this.asked - step),
+      ArrowRight: () => this.show(this.asked + step),
       Home: () => this.show(0),
       End: () => this.show(this.state.rows - 1),
       " ": () => this.play(),
