@@ -74,10 +74,11 @@ class Tracker:
     def advance(self, image: Array) -> Dots:
         """The markers' dots (M) in the next frame; sigma is NaN where a marker is not visible."""
         self.frame_count += 1
-        belief = self._predict_next()
+        all_visible = (self._visible_on_body() | self.static_dots.mask).all()
+        belief = None if all_visible else self._predict_next()  # it takes time, and a search may not be needed
         dots = Dots.missing(len(self.sigma))
         if self.motion.errors.min() < MAX_RELIABLE_ERROR:
-            dots = self._fit_at_expected(image, belief.position)
+            dots = self._fit_at_expected(image, self.motion.predict() if belief is None else belief.position)
         visible, shown = self.frames_missing == 0, np.isfinite(dots.sigma[:, 0])
         self.frames_since_search += 1
         none_lost = bool(visible.any() and shown[visible].all())
@@ -85,7 +86,7 @@ class Tracker:
             reliable = none_lost or self.motion.errors.min() < MAX_CONFIRMED_ERROR
             own, body = _restrict(dots, visible & reliable), ~self.static_dots.mask
             lost = (self.frames_missing[body] > MAX_EXTRAPOLATED_FRAMES).all()
-            found = own if lost else self._search(image, [belief], own)
+            found = own if lost else self._search(image, [belief or self._predict_next()], own)
             separation = MIN_SEPARATION_RADII * self.appearance.radius
             same = shown & (np.linalg.norm(found.centre - dots.centre, axis=1) < separation)
             rows = np.flatnonzero(same & np.isfinite(found.sigma[:, 0]))
