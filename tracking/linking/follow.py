@@ -16,13 +16,14 @@ from rafl.tracking.detection.detect import Dots, to_eight_bits
 from rafl.tracking.linking.late_markers import LateMarker
 from rafl.tracking.linking.repeated_frames import find_repeated_frames
 from rafl.tracking.linking.shape_prior import ShapePrior
-from rafl.tracking.linking.tracker import MIN_SHAPES, Tracker
+from rafl.tracking.linking.tracker import Tracker
 from rafl.tracking.reconstruction.uncertainty import with_error_floor
 from rafl.tracking.video.reader import Video
 
 Array = NDArray[Any]
 
 MIN_MARKERS = 3
+MIN_SHAPES = 6  # with fewer shapes, the shape prior is not relied on for the start of late-detected markers
 WORST_FRAME_COUNT = 10  # frames whose images are kept for the report
 
 

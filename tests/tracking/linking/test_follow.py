@@ -174,6 +174,17 @@ def test_dots_keep_their_identity_while_a_bar_passes() -> None:
     assert np.isfinite(distance[-1]).all()
 
 
+def test_a_body_that_was_hidden_wholly_is_found_again_with_its_identities() -> None:
+    """After its motion is forgotten, only the shapes seen before tell which dot is which."""
+    truth = bent(marker_grid(), 20.0 * np.sin(2 * np.pi * np.arange(60) / 12.4))
+    positions = truth.copy()
+    positions[25:40] = np.nan
+    tracks = track(Drawn(positions))
+    distance = distances(tracks, truth)
+    assert np.nanmax(distance) < 0.5
+    assert np.isfinite(distance[-1]).all()
+
+
 def test_dots_hidden_at_first_are_detected_late() -> None:
     """A hand holds the specimen for fifteen frames. Then it swings, and the dots are tracked once they are visible."""
     rest = marker_grid()
