@@ -15,8 +15,9 @@ import uvicorn
 from playwright.sync_api import sync_playwright
 
 from rafl.calibration.rig import parse_calibration
-from rafl.review.recordings import Library
 from rafl.review.server import create_server
+from rafl.review.tracks.calls import TracksView
+from rafl.review.tracks.recordings import Library
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
 
@@ -49,7 +50,7 @@ def main(demo: Path) -> None:
         write_tracks(folder / f"{RECORDING}.h5", with_exchanged(read_tracks(folder / f"{RECORDING}.h5")))
         listener = socket.create_server(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-        app = create_server(Library(folder, None, "Ann"), "gallery", port)
+        app = create_server(TracksView(Library(folder, None, "Ann")), "gallery", port)
         server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()

@@ -41,4 +41,4 @@ def review(
         raise InputError(f"--name: {error}; give your name with --name") from None
     from rafl.review import commands
 
-    commands.serve(tracks, videos, who, port, browser)
+    commands.serve(commands.open_tracks(tracks, videos, who), port, browser)

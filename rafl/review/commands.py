@@ -14,31 +14,45 @@ from rafl.common.command_line import one_line
 from rafl.common.errors import InputError
 from rafl.common.interruption import Terminated
 from rafl.common.kernels import announce_compilation
-from rafl.review.recordings import Library
-from rafl.review.server import create_server
+from rafl.review.server import View, create_server
+from rafl.review.tracks.calls import TracksView
+from rafl.review.tracks.recordings import Library
 from rafl.tracking.single_marker import load_kernels
 
 HOST = "127.0.0.1"
 SHUTDOWN_S = 2  # for requests that are being answered when the command is stopped
 
 
-def serve(tracks: Path, videos: Path | None, who: str, port: int, browser: bool) -> None:
-    """Serve the page until Ctrl-C.
+def open_tracks(tracks: Path, videos: Path | None, who: str) -> TracksView:
+    """The view of a folder of tracks.
 
     Args:
         tracks: folder of tracks.
         videos: folder of videos; None where `rafl-track` found them.
         who: name for the corrections.
-        port: on the loopback interface; 0 for a free one.
-        browser: whether to open the page.
 
     Raises:
-        InputError: there are no tracks, or the port is taken.
+        InputError: there are no tracks.
     """
     library = Library(tracks, videos, who)
     if not library.names():
         raise InputError(f"expected tracks (.h5) in {tracks}, found none; track the videos with rafl-track")
     announce_compilation()
+    threading.Thread(target=load_kernels, daemon=True).start()
+    return TracksView(library)
+
+
+def serve(view: View, port: int, browser: bool) -> None:
+    """Serve the page of a view until Ctrl-C.
+
+    Args:
+        view: what is shown.
+        port: on the loopback interface; 0 for a free one.
+        browser: whether to open the page.
+
+    Raises:
+        InputError: the port is taken.
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP) as listener:
         # With its protocol named, connections send at once instead of waiting for acknowledgements (TCP_NODELAY).
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -48,13 +62,12 @@ def serve(tracks: Path, videos: Path | None, who: str, port: int, browser: bool)
         except OSError as error:
             raise InputError(f"--port: expected a free port, found {port}: {error.strerror}; choose another") from None
         port = listener.getsockname()[1]
-        threading.Thread(target=load_kernels, daemon=True).start()
         token = secrets.token_urlsafe(24)
         address = f"http://{HOST}:{port}/?token={token}"
-        typer.echo(f"{len(library.names())} recordings in {one_line(str(tracks))}; Ctrl-C ends")
+        typer.echo(f"{one_line(view.title)}; Ctrl-C ends")
         typer.echo(f"open {address}")
         opening = threading.Thread(target=webbrowser.open, args=(address,), daemon=True)
-        app = create_server(library, token, port, opening.start if browser else None)
+        app = create_server(view, token, port, opening.start if browser else None)
         config = uvicorn.Config(app, log_level="error", access_log=False, timeout_graceful_shutdown=SHUTDOWN_S)
         try:
             with threadpool_limits(1, user_api="blas"):  # threads for matrices this small would only wait

@@ -16,8 +16,9 @@ from filmed import Film, make_film, with_swapped
 from served import Served
 from starlette.testclient import TestClient
 
-from rafl.review.recordings import Library
 from rafl.review.server import create_server
+from rafl.review.tracks.calls import TracksView
+from rafl.review.tracks.recordings import Library
 from rafl.tracking.reconstruction.tracks import write_tracks
 
 PORT, TOKEN = 4321, "token-of-the-tests"
@@ -45,7 +46,7 @@ def film(filmed: Film, tmp_path: Path) -> Film:
 @pytest.fixture
 def client(film: Film) -> Iterator[TestClient]:
     """A browser that has opened the address of a server on the film."""
-    app = create_server(Library(film.path.parent, None, "Ann"), TOKEN, PORT)
+    app = create_server(TracksView(Library(film.path.parent, None, "Ann")), TOKEN, PORT)
     with TestClient(app, base_url=f"http://127.0.0.1:{PORT}") as found:
         assert found.get(f"/?token={TOKEN}").status_code == 200
         yield found
@@ -59,7 +60,7 @@ def serve() -> Iterator[Callable[[Path], str]]:
     def start(folder: Path) -> str:
         listener = socket.create_server(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-        app = create_server(Library(folder, None, "Ann"), TOKEN, port)
+        app = create_server(TracksView(Library(folder, None, "Ann")), TOKEN, port)
         server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()

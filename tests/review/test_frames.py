@@ -10,7 +10,7 @@ import simplejpeg
 from filmed import frame_image, read_counter, write_film
 from support import SHARED
 
-from rafl.review.frames import FrameStore
+from rafl.review.tracks.frames import FrameStore
 from rafl.tracking.single_marker import dot_at, follow_on
 from rafl.tracking.video.reader import open_video
 

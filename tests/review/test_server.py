@@ -14,8 +14,9 @@ import simplejpeg
 from filmed import Film, read_counter
 from starlette.testclient import TestClient
 
-from rafl.review.recordings import Library
 from rafl.review.server import create_server
+from rafl.review.tracks.calls import TracksView
+from rafl.review.tracks.recordings import Library
 from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
 from rafl.tracking.reconstruction.corrections import corrections_path, read_corrections
 from rafl.tracking.reconstruction.tracks import read_tracks, write_tracks
@@ -294,7 +295,7 @@ def test_tracks_of_earlier_programs(client: TestClient, film: Film, tmp_path: Pa
     assert "--videos" in answer.json()["error"]
     shutil.move(film.folder / "videos", tmp_path / "moved")
     with TestClient(
-        create_server(Library(film.path.parent, tmp_path / "moved", "Ann"), TOKEN, PORT),
+        create_server(TracksView(Library(film.path.parent, tmp_path / "moved", "Ann")), TOKEN, PORT),
         base_url=f"http://127.0.0.1:{PORT}",
     ) as other:
         other.get(f"/?token={TOKEN}")
@@ -317,7 +318,7 @@ def test_tracks_without_cameras_can_be_looked_at(client: TestClient, film: Film)
 
 def test_requests_from_elsewhere_are_refused(client: TestClient, film: Film) -> None:
     fresh = TestClient(client.app, base_url=f"http://127.0.0.1:{PORT}", follow_redirects=False)
-    for path in ("/", "/static/main.js", "/api/recordings", "/?token=wrong", "/api/recording?name=swing"):
+    for path in ("/", "/static/tracks/main.js", "/api/recordings", "/?token=wrong", "/api/recording?name=swing"):
         assert fresh.get(path).status_code == 403
     fresh.cookies.set(f"rafl-review-{PORT}", "wrong")
     assert fresh.get("/api/recordings").status_code == 403
@@ -348,21 +349,23 @@ def test_nothing_outside_the_folder_is_read(client: TestClient, film: Film) -> N
             assert client.get(f"/api/{call}", params={"name": name}).status_code == 422, name
         assert client.get("/api/frame", params={"name": name, "camera": "left", "number": 0}).status_code == 404
         assert client.post("/api/claim", params={"name": name, "page": "x"}).status_code == 422
-    for path in ("/static/../server.py", "/static/..%2fserver.py", "/static/%2e%2e/server.py", "/static/LICENSE"):
+    for path in ("/static/../server.py", "/static/..%2fserver.py", "/static/%2e%2e/server.py", "/static/uplot/LICENSE"):
         assert client.get(path).status_code in (403, 404), path
     assert client.get("/api/frame", params=NAME | {"camera": "../left", "number": 0}).status_code == 404
 
 
 def test_every_answer_forbids_foreign_scripts(client: TestClient) -> None:
-    for path in ("/", "/static/main.js", "/api/recordings", "/nothing"):
+    for path in ("/", "/static/tracks/main.js", "/api/recordings", "/nothing"):
         headers = client.get(path).headers
         assert "default-src 'none'; script-src 'self'" in headers["content-security-policy"]
         assert headers["x-content-type-options"] == "nosniff"
     text = client.get("/").text
     assert "http:" not in text
     assert "https:" not in text
-    for script in ("main", "api", "view", "plots", "list", "panels", "recording"):
-        code = client.get(f"/static/{script}.js").text
+    for script in ("api", *(f"tracks/{name}" for name in ("main", "view", "plots", "list", "panels", "recording"))):
+        answer = client.get(f"/static/{script}.js")
+        assert answer.status_code == 200
+        code = answer.text
         assert "innerHTML" not in code
         assert "http" not in code
     assert json.loads(client.get("/api/recordings").text)

@@ -1,9 +1,9 @@
 // One recording: frames with markers, plots, stretches to look at, and corrections.
 
 import { Images, Rows, get, leave, page, post } from "/static/api.js";
-import { Plots } from "/static/plots.js";
-import { showCorrections, showNotes, showStretches } from "/static/panels.js";
-import { CameraView } from "/static/view.js";
+import { Plots } from "/static/tracks/plots.js";
+import { showCorrections, showNotes, showStretches } from "/static/tracks/panels.js";
+import { CameraView } from "/static/tracks/view.js";
 
 const CLAIM_MS = 1500;
 const PREFETCHED = 4; // frames ahead of the one shown

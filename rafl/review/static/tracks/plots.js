@@ -1,6 +1,6 @@
 // Plots of the selected marker over time, with a line at the frame shown. A click jumps there.
 
-import uPlot from "/static/uPlot.esm.js";
+import uPlot from "/static/uplot/uPlot.esm.js";
 import { getArray } from "/static/api.js";
 
 const AXIS = {

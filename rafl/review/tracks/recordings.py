@@ -13,7 +13,7 @@ from rafl.common.errors import InputError
 from rafl.common.files import sha256
 from rafl.common.hdf5_files import read_hdf5
 from rafl.common.names import check_name
-from rafl.review.recording import OpenRecording
+from rafl.review.tracks.recording import OpenRecording
 from rafl.tracking.reconstruction.corrections import corrections_path
 from rafl.tracking.reconstruction.gap_filling import FILLED, MEASURED, MISSING
 from rafl.tracking.reconstruction.tracks import LABEL, Tracks

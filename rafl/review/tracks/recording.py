@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.common.errors import InputError
-from rafl.review.frames import FrameStore
+from rafl.review.server import ReadOnlyError
+from rafl.review.tracks.frames import FrameStore
 from rafl.tracking.reconstruction.corrected_tracks import apply_corrections
 from rafl.tracking.reconstruction.corrections import (
     Correction,
@@ -29,10 +30,6 @@ Array = NDArray[Any]
 CLAIM_S = 70.0
 
 FindVideo = Callable[[str, str, Tracks], Video]
-
-
-class ReadOnlyError(Exception):
-    """Another page has the recording."""
 
 
 class OpenRecording:

@@ -1,7 +1,7 @@
 // Which view is shown: `#/` the list, `#/recording/<name>` one recording.
 
-import { showList } from "/static/list.js";
-import { Recording } from "/static/recording.js";
+import { showList } from "/static/tracks/list.js";
+import { Recording } from "/static/tracks/recording.js";
 
 let open = null;
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
-from rafl.review.recording import OpenRecording
+from rafl.review.tracks.recording import OpenRecording
 from rafl.tracking.reconstruction.gap_filling import FILLED
 
 Array = NDArray[Any]

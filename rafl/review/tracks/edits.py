@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from rafl.common.errors import InputError
 from rafl.common.yaml_files import describe_validation
-from rafl.review.recording import OpenRecording
+from rafl.review.tracks.recording import OpenRecording
 from rafl.tracking.reconstruction.corrections import Accept, Delete, Place, Rename, Swap, path_text
 from rafl.tracking.single_marker import PointedDot, dot_at, follow_on
 

@@ -1,0 +1,1 @@
+"""Tracks over their videos: what the page shows, and corrections."""

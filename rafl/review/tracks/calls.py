@@ -1,0 +1,138 @@
+"""The calls of the page of tracks, each of which reads or corrects one recording."""
+
+from typing import Annotated
+
+from fastapi import Body, FastAPI, Response
+from fastapi.responses import JSONResponse
+
+from rafl.calibration.rig import Rig, parse_calibration
+from rafl.common.errors import InputError
+from rafl.review.tracks.blocks import block, series
+from rafl.review.tracks.edits import Action, perform
+from rafl.review.tracks.recording import OpenRecording
+from rafl.review.tracks.recordings import Library
+from rafl.review.tracks.stretches import find_stretches
+
+MAX_SUMMARIES = 50  # of one call
+NO_VIDEO = 404
+
+
+class TracksView:
+    """The view of a folder of tracks; see `View`."""
+
+    page = "tracks/tracks.html"
+
+    def __init__(self, library: Library) -> None:
+        self.library = library
+        self.title = f"{len(library.names())} recordings in {library.folder}"
+
+    def add_calls(self, app: FastAPI) -> None:
+        """Add the calls that read and those that correct."""
+        _add_reading_calls(app, self.library)
+        _add_correcting_calls(app, self.library)
+
+    def close(self) -> None:
+        """Close all videos."""
+        self.library.close()
+
+
+def _rig(recording: OpenRecording) -> Rig | None:
+    """The cameras with which a recording was tracked; None if the tracks do not hold them."""
+    try:
+        return parse_calibration(recording.raw.calibration, recording.path) if recording.raw.calibration else None
+    except InputError:
+        return None
+
+
+def _state(recording: OpenRecording) -> dict[str, object]:
+    """What changes with a correction."""
+    entries = [
+        entry.model_dump(mode="json", exclude={"path"})
+        | ({"frames": len(entry.positions)} if entry.kind == "place" else {})
+        for entry in recording.corrections
+    ]
+    return {
+        "revision": recording.revision,
+        "names": recording.tracks.names,
+        "corrections": entries,
+        "unfit": recording.found.unfit,
+        "redo": len(recording.undone),
+    }
+
+
+def _add_reading_calls(app: FastAPI, library: Library) -> None:
+    @app.get("/api/recordings")
+    def recordings() -> dict[str, object]:
+        names = library.names()
+        return {
+            "folder": library.folder.resolve().name,
+            "recordings": [{"name": name, "corrected": library.has_corrections(name)} for name in names],
+        }
+
+    @app.post("/api/summaries")
+    def summaries(names: Annotated[list[str], Body(max_length=MAX_SUMMARIES)]) -> dict[str, object]:
+        found: dict[str, object] = {}
+        for name in names:
+            try:
+                found[name] = library.summary(name)
+            except InputError as error:
+                found[name] = {"error": str(error)}
+        return found
+
+    @app.get("/api/recording")
+    def recording(name: str) -> dict[str, object]:
+        found = library.open(name, anew=True)
+        rig = _rig(found)
+        tracks = found.raw
+        return _state(found) | {
+            "name": name,
+            "rows": len(tracks.time),
+            "fps": tracks.fps,
+            "notes": tracks.notes,
+            "has_calibration": rig is not None,
+            "cameras": [
+                {"name": camera, "size": rig.cameras[camera].image_size if rig and camera in rig.cameras else None}
+                for camera in tracks.pixel
+            ],
+            "corrections_file": found.beside.name,
+        }
+
+    @app.get("/api/block")
+    def rows(name: str, first: int, count: int) -> Response:
+        found = library.open(name)
+        return Response(block(found, _rig(found), first, count), media_type="application/octet-stream")
+
+    @app.get("/api/series")
+    def values(name: str, marker: int, camera: str) -> Response:
+        return Response(series(library.open(name), marker, camera), media_type="application/octet-stream")
+
+    @app.get("/api/stretches")
+    def stretches(name: str) -> list[dict[str, object]]:
+        return [vars(item) for item in find_stretches(library.open(name).found)]
+
+    @app.get("/api/frame")
+    def frame(name: str, camera: str, number: int) -> Response:
+        try:
+            content = library.open(name).frames(camera).jpeg(number)
+        except InputError as error:
+            return JSONResponse({"error": str(error)}, NO_VIDEO)
+        if content is None:
+            return JSONResponse({"error": f"frame {number} of camera {camera} is damaged"}, NO_VIDEO)
+        return Response(content, media_type="image/jpeg")
+
+
+def _add_correcting_calls(app: FastAPI, library: Library) -> None:
+    @app.post("/api/claim")
+    def claim(name: str, page: str) -> dict[str, object]:
+        found = library.open(name)
+        return {"writable": found.claim_for(page), "revision": found.revision}
+
+    @app.post("/api/release")
+    def release(name: str, page: str) -> None:
+        library.open(name).release(page)
+
+    @app.post("/api/correct")
+    def correct(name: str, page: str, action: Action) -> dict[str, object]:
+        found = library.open(name)
+        with found.editing:
+            return perform(found, page, action) | _state(found)
