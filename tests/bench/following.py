@@ -1,4 +1,4 @@
-"""Tracking benchmark: identities of markers that move, are occluded, leave and return; gap filling; and speed."""
+"""Tracking benchmark: identities of markers that move, are occluded, appear late or return; gap filling; speed."""
 
 import tempfile
 import time
@@ -20,6 +20,7 @@ from rafl.tracking.video.frame import Frame
 from rafl.tracking.video.reader import Reading, Video, open_video
 
 EXPOSURE = 0.2  # fraction of the time between two frames
+BLOBS_FROM = 5  # frame that first shows the static dots beside the body
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,7 @@ class SyntheticVideo:
         noise: standard deviation of the sensor's noise [grey levels].
         seed: of the noise.
         occluded: dots that are not drawn, (T, D); None for none.
+        blobs: static dots beside the body, drawn from frame 5 on [px], (B, 2); None for none.
         path: for messages.
     """
 
@@ -38,6 +40,7 @@ class SyntheticVideo:
     noise: float
     seed: int
     occluded: np.ndarray | None = None
+    blobs: np.ndarray | None = None
     path: Path = Path("drawn")
     predicted_frames: bool = False
 
@@ -51,9 +54,11 @@ class SyntheticVideo:
         for t, current in enumerate(centres):
             velocity = 0.5 * (centres[min(t + 1, len(centres) - 1)] - centres[max(t - 1, 0)])
             visible = np.ones(len(current), bool) if self.occluded is None else ~self.occluded[t]
-            semi_axes = np.full((len(current), 2), self.beam.radius)
-            ellipses = np.column_stack([current, semi_axes, np.zeros(len(current))])[visible]
-            image = expose(draw(scene, ellipses, random, EXPOSURE * velocity[visible]), scene, random)
+            shown, motion = current[visible], EXPOSURE * velocity[visible]
+            if self.blobs is not None and t >= BLOBS_FROM:
+                shown, motion = np.concatenate([shown, self.blobs]), np.pad(motion, ((0, len(self.blobs)), (0, 0)))
+            ellipses = np.column_stack([shown, np.full((len(shown), 2), self.beam.radius), np.zeros(len(shown))])
+            image = expose(draw(scene, ellipses, random, motion), scene, random)
             yield Frame(0.01 * t, image)
 
 
@@ -147,6 +152,42 @@ def measure_occlusion(random: np.random.Generator, quick: bool) -> Iterator[Meas
         yield Measurement("recordings with a wrong identity", case, sum(item.wrong > 0 for item in results), "0")
         yield Measurement("dots not measured in the last frame", case, sum(r.unmeasured_at_end for r in results), "0")
         yield Measurement("visible dots not measured [%]", case, unmeasured)
+
+
+def measure_late_markers(random: np.random.Generator, quick: bool) -> Iterator[Measurement]:
+    count, frames = 20 if quick else 100, 120
+    complete = wrong = 0
+    for k in range(count):
+        beam = random_beam(random, frames, random.uniform(0.3, 1.0))
+        dots = beam.centres.shape[1]
+        side = np.argsort(beam.centres[0] @ random.normal(size=2))
+        occluded = np.zeros((frames, dots), bool)
+        occluded[: random.integers(10, 41), (side if k % 2 else random.permutation(dots))[: dots // 3]] = True
+        errors = linking_errors(SyntheticVideo(beam, random.uniform(2, 6), k, occluded))
+        complete += errors.unmeasured_at_end == 0
+        wrong += errors.wrong > 0
+    case = f"{count} bodies, a third of the dots appears late"
+    yield Measurement("bodies with all late markers found [%]", case, 100 * complete / count, ">= 95")
+    yield Measurement("recordings with a wrong identity", case, wrong, "0")
+    taken = 0
+    for k in range(count):
+        beam = random_beam(random, frames, random.uniform(0.1, 1.0))
+        video = SyntheticVideo(beam, random.uniform(2, 6), k, blobs=_blobs_beside(beam, random, 8))
+        taken += follow(video, lambda: None).late_count > 0
+    case = f"{count} bodies beside 8 static dots"
+    yield Measurement("recordings with a static dot taken for a marker", case, taken, "0")
+
+
+def _blobs_beside(beam: Beam, random: np.random.Generator, count: int) -> np.ndarray:
+    """Up to `count` random places in the image that no dot touches in any frame [px], (B, 2)."""
+    kept = beam.centres.reshape(-1, 2)
+    found: list[np.ndarray] = []
+    for _ in range(50 * count):
+        place = random.uniform(2.0 * beam.radius, np.array(beam.size) - 2.0 * beam.radius)
+        if len(found) < count and np.linalg.norm(kept - place, axis=1).min() > 2.6 * beam.radius:
+            kept = np.concatenate([kept, place[None]])
+            found.append(place)
+    return np.array(found).reshape(-1, 2)
 
 
 def measure_gap_filling(random: np.random.Generator, quick: bool) -> Iterator[Measurement]:

@@ -17,7 +17,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import trackpy
-from following import measure_gap_filling, measure_linking, measure_occlusion, measure_speed
+from following import (
+    measure_gap_filling,
+    measure_late_markers,
+    measure_linking,
+    measure_occlusion,
+    measure_speed,
+)
 from footage import Measurement
 from geometry import measure_calibration, measure_reconstruction
 from localisation import measure_localisation
@@ -40,9 +46,11 @@ SECTIONS: dict[str, Callable[..., Iterator[Measurement]]] = {
     "speed": measure_speed,
     "calibrating": measure_calibration,
     "reconstructing": measure_reconstruction,
+    "late": measure_late_markers,
 }
 TITLES = {
     "hiding": "occlusion",
+    "late": "late-detected markers",
     "filling": "gap filling",
     "calibrating": "calibration",
     "reconstructing": "reconstruction",

@@ -46,8 +46,6 @@ SEARCH_SIGMAS = 3.0  # dots are searched within this many sigmas of the markers'
 STATIC_SIGMA = 0.03  # of a static dot's position about its first one [spacings]
 MAX_EXTRAPOLATED_FRAMES = 3  # for which a hidden marker's own motion still predicts its position
 SIGMA_GROWTH = 1.5  # factor per frame on the sigma of a hidden marker's predicted position
-# A dot with a larger misfit [share of the contrast] is fitted again from the median disc, in a marker's first frames.
-MAX_YOUNG_MISFIT, YOUNG_FRAMES = 0.1, 8
 # If most markers are missing, so many of the shapes seen so far are tried, each with errors of this sigma [spacings].
 MAX_RECALLED_SHAPES, RECALLED_SIGMA = 16, 0.2
 SEARCH_INTERVAL = 4  # frames between searches for hidden markers
@@ -69,13 +67,9 @@ class Tracker:
         self.sigma = np.zeros(len(first))  # sigma of each marker's position; 0 if identified [px]
         self.frames_since_search = 0
         self.late_markers = LateMarkerFinder(appearance, np.zeros(len(first)))
-        self.frame_count = 0  # tracked so far
-        self.first_frame = np.zeros(len(first), dtype=np.int64)  # `frame_count` when each marker was added
-        self.starts_from_median = np.zeros(len(first), bool)  # markers whose own last disc is a bad start of fits
 
     def advance(self, image: Array) -> Dots:
         """The markers' dots (M) in the next frame; sigma is NaN where a marker is not visible."""
-        self.frame_count += 1
         all_visible = (self._visible_on_body() | self.static_dots.mask).all()
         belief = None if all_visible else self._predict_next()  # it takes time, and a search may not be needed
         dots = Dots.missing(len(self.sigma))
@@ -85,7 +79,8 @@ class Tracker:
         self.frames_since_search += 1
         none_lost = bool(visible.any() and shown[visible].all())
         if not none_lost or (shown & ~visible).any() or self.frames_since_search >= self._interval():
-            reliable = none_lost or self.motion.errors.min() < MAX_CONFIRMED_ERROR
+            # A body that hardly moved in the first frame may start to move: only predictions by velocity tell.
+            reliable = none_lost or self.motion.errors[1:].min() < MAX_CONFIRMED_ERROR
             own, body = _restrict(dots, visible & reliable), ~self.static_dots.mask
             lost = (self.frames_missing[body] > MAX_EXTRAPOLATED_FRAMES).all()
             found = own if lost else self._search(image, [belief or self._predict_next()], own)
@@ -115,8 +110,6 @@ class Tracker:
             self.prior = self.prior.with_marker(marker.rest)
             self.motion.add_marker(self._last_positions(marker, number))
             self.static_dots.add_marker()
-            self.starts_from_median = np.append(self.starts_from_median, False)
-            self.first_frame = np.append(self.first_frame, self.frame_count)
             self.pattern = MarkerPattern.of(np.concatenate([self.pattern.rest, marker.rest[None]]))
             self.parameters = np.concatenate([self.parameters, marker.parameters[None]])
             self.frames_missing = np.append(self.frames_missing, 0 if number in marker.seen else 1)
@@ -196,34 +189,13 @@ class Tracker:
         """The dots fitted at the expected positions (M, 2); none if too few of them belong to their markers."""
         start = self.parameters.copy()
         start[:, :2] = expected
-        if self.starts_from_median.any():
-            start[self.starts_from_median] = self._median_discs(expected[self.starts_from_median])
         dots = fit_dots(image, start)
-        if self.frame_count < self.first_frame[-1] + YOUNG_FRAMES:
-            dots = self._refit_from_median(image, dots, start)
         good = self.appearance.matches(dots)
         separation = MIN_SEPARATION_RADII * self.appearance.radius
         reliable = _select_own_dots(
             dots.parameters, self.parameters, expected, self._visible_on_body(), self.pattern.spacing, separation, good
         )
         return _restrict(dots, good & reliable)
-
-    def _refit_from_median(self, image: Array, dots: Dots, start: Array) -> Dots:
-        """The dots, those with a large misfit replaced by fits from the median disc where these have a smaller one.
-
-        A marker's own last disc may mistake the edge of its sticker, or a strip of specular highlight, for its blur. A
-        fit from it may then jump. The replaced markers are fitted from the median disc from now on.
-        """
-        young = self.frame_count < self.first_frame + YOUNG_FRAMES
-        good = self.appearance.matches(dots) & (dots.misfit < MAX_YOUNG_MISFIT)
-        bad = np.flatnonzero(self._visible_on_body() & young & ~self.starts_from_median & ~good)
-        if not len(bad):
-            return dots
-        starts = np.concatenate([self._median_discs(start[bad, :2]), np.delete(start, bad, axis=0)])
-        found = fit_dots(image, starts, len(bad))
-        better = self.appearance.matches(found) & ~(found.misfit > dots.misfit[bad])
-        self.starts_from_median[bad[better]] = True
-        return _replace_rows(dots, bad[better], found[better])
 
     def _median_discs(self, positions: Array) -> Array:
         """Initial parameters (D, 12) of discs with the markers' median shape and contrast at positions (D, 2)."""
