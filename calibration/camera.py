@@ -1,6 +1,6 @@
 """Camera models: projection of world points to pixels, and its inverse distortion."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 Array = NDArray[Any]
+
+COMPLEX_STEP = 1e-20  # [m]; its square vanishes beside 1 in the computer
 
 
 @dataclass(frozen=True)
@@ -73,9 +75,36 @@ class Camera:
         direction: Array = self.rotation[2]
         return direction
 
+    def in_frame(self, rotation: Array, translation: Array) -> "Camera":
+        """This camera in another world frame, in which a point X has the coordinates R X + t.
+
+        The calibration's covariance is that of the old frame; the camera in the new one has none.
+
+        Args:
+            rotation: R, (3, 3).
+            translation: t [m], (3).
+        """
+        turned = self.rotation @ rotation.T
+        plane = self.plane
+        if plane is not None:
+            normal = rotation @ plane.normal
+            plane = replace(plane, normal=tuple(normal.tolist()), offset=plane.offset + float(normal @ translation))
+        vector = tuple(Rotation.from_matrix(turned).as_rotvec().tolist())
+        return replace(self, rotation_vector=vector, plane=plane, covariance=None)
+
     def project_undistorted(self, points: Array) -> Array:
         """Undistorted pixels (..., 2) of world points (..., 3) [m]."""
         raise NotImplementedError
+
+    def jacobian(self, points: Array) -> Array:
+        """Derivative of `project`, with the distortion, with respect to the point [px/m], (..., 2, 3).
+
+        By complex steps, which are exact to rounding: the projection is analytic.
+        """
+        directions = 1j * COMPLEX_STEP * np.eye(3)
+        columns = [self.project(points + direction).imag / COMPLEX_STEP for direction in directions]
+        result: Array = np.stack(columns, axis=-1)
+        return result
 
     def projection_jacobian(self, points: Array) -> Array:
         """Derivative of `project_undistorted` with respect to the point [px/m], (..., 2, 3)."""
@@ -140,6 +169,17 @@ class OrthographicCamera(Camera):
     distortion: tuple[float, float] = (0.0, 0.0)
     perspective: Perspective | None = None
 
+    def in_frame(self, rotation: Array, translation: Array) -> "OrthographicCamera":
+        """See `Camera`."""
+        moved = super().in_frame(rotation, translation)
+        assert isinstance(moved, OrthographicCamera)
+        offset = np.asarray(self.offset) - moved.projection_matrix @ translation
+        seen = self.perspective
+        if seen is not None:
+            along = float(moved.viewing_direction @ translation)
+            seen = replace(seen, distance=seen.distance - along, depth=seen.depth + along)
+        return replace(moved, offset=tuple(offset.tolist()), perspective=seen)
+
     @cached_property
     def projection_matrix(self) -> Array:
         """K2 R[:2]: undistorted pixels per metre of world displacement, (2, 3)."""
@@ -196,6 +236,13 @@ class PinholeCamera(Camera):
     translation: tuple[float, float, float]
     skew: float = 0.0
     distortion: tuple[float, float, float, float, float] = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def in_frame(self, rotation: Array, translation: Array) -> "PinholeCamera":
+        """See `Camera`."""
+        moved = super().in_frame(rotation, translation)
+        assert isinstance(moved, PinholeCamera)
+        origin = np.asarray(self.translation) - moved.rotation @ translation
+        return replace(moved, translation=tuple(origin.tolist()))
 
     @cached_property
     def _k2(self) -> Array:

@@ -20,7 +20,7 @@ from rafl.capture.description.describe import Description, describe
 from rafl.capture.description.drawing import draw_description
 from rafl.capture.description.specimen_text import body_like, body_of_box, body_of_surface, specimen_text
 from rafl.capture.description.stencil import design_stencil, stencil_pdf
-from rafl.capture.registration.places import MODULUS_SIGMA
+from rafl.capture.registration.initial import MODULUS_SIGMA
 from rafl.capture.registration.registration import RestPose as RestPose
 from rafl.capture.rendering.film import ENCODINGS, render_video, side_cameras, write_board_images, write_truth
 from rafl.capture.rendering.motion import SimulatedMotion, tip_load_release, twist_release

@@ -10,6 +10,7 @@ from rafl.common.errors import InputError
 from rafl.common.files import require_file
 
 METHODS = ("auto", "rafl", "srl", "sysid", "sysid-e", "sysid-damping", "sysid-loss", "sysid-branches", "constitutive")
+OBJECTIVES = ("image", "3d")
 INTEGRATORS = ("implicit-euler", "generalised-alpha")
 DATASET = "a dataset (.h5, written by rafl-capture)"
 
@@ -67,6 +68,13 @@ def fit(
     by_sigma: Annotated[
         bool, typer.Option("--by-sigma", help="Weight markers by their uncertainty (rafl, sysid).")
     ] = False,
+    objective: Annotated[
+        str,
+        typer.Option(
+            help="Compare the pixels that the cameras measured (image) or 3-D positions (3d) [image where a dataset "
+            "has pixels]."
+        ),
+    ] = "",
     limit_energy: Annotated[
         bool, typer.Option(help="Limit the energy that the field adds to a motion by that in training (rafl).")
     ] = True,
@@ -83,6 +91,8 @@ def fit(
         raise InputError(f"--method: expected {', '.join(METHODS)}, found {method!r}")
     if integrator and integrator not in INTEGRATORS:
         raise InputError(f"--integrator: expected {' or '.join(INTEGRATORS)}, found {integrator!r}")
+    if objective and objective not in OBJECTIVES:
+        raise InputError(f"--objective: expected {' or '.join(OBJECTIVES)}, found {objective!r}")
     if frames == 1:
         raise InputError("--frames: expected 0 (all) or at least 2, found 1")
     for path in datasets:
@@ -102,6 +112,7 @@ def fit(
         "start": start,
         "integrator": integrator,
         "by_sigma": by_sigma,
+        "objective": objective,
         "limit_energy": limit_energy,
     }
     commands.fit(datasets, out, method, tensorboard, resume, options)

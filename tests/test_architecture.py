@@ -8,7 +8,7 @@ from support import ROOT
 
 # Each layer imports from those that follow it, never from those before it; `|` separates layers that do not import
 # each other.
-PACKAGES = ["review", "api|commands|cli", "capture", "tracking", "calibration|physics", "common"]
+PACKAGES = ["review", "api|commands|cli", "capture", "tracking|physics", "calibration", "common"]
 TRACKING = ["linking", "video", "detection", "reconstruction"]
 INSIDE = {
     "rafl": ["evaluation", "fitting", "residual", "data", "simulation", "solvers", "fem"],

@@ -71,13 +71,8 @@ def _pinhole(rig: Rig, name: str) -> PinholeCamera:
 
 def _moved(camera: PinholeCamera, values: Array) -> PinholeCamera:
     """The camera with the rotation vector and translation [m] of X_old = R X + t applied before it, (6)."""
-    rotation = camera.rotation @ Rotation.from_rotvec(values[:3]).as_matrix()
-    translation = camera.rotation @ values[3:] + np.asarray(camera.translation)
-    return replace(
-        camera,
-        rotation_vector=tuple(Rotation.from_matrix(rotation).as_rotvec().tolist()),
-        translation=tuple(translation.tolist()),
-    )
+    back = Rotation.from_rotvec(values[:3]).as_matrix().T
+    return camera.in_frame(back, -back @ values[3:])
 
 
 def _starts(camera: PinholeCamera, view: KnownPoints) -> list[Array]:

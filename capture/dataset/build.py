@@ -1,7 +1,7 @@
 """Building of datasets: registers recordings to a specimen and fits their first frames."""
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from rafl.common.errors import InputError
 from rafl.data.dataset import MAX_RELATIVE_TIME_ERROR, Dataset, Trajectory
 from rafl.data.markers import Markers
 from rafl.data.synthetic import load_force
+from rafl.data.views import View
 
 Array = NDArray[Any]
 
@@ -135,13 +136,17 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
     added_mass = np.zeros(len(specimen.mesh.vertices))
     added_mass[specimen.loaded] = load / len(specimen.loaded)
     chosen = slice(start.frame, item.last + 1)
-    time, markers, sigma = _on_even_grid(recording, position, sigma, chosen, simulator.time_step, row)
+    grid = _EvenGrid.of(recording.time[chosen], simulator.time_step, start.frame, row)
+    markers = grid.fill(position[chosen], np.nan)
+    sigma = grid.fill(np.where(np.isfinite(position) & np.isfinite(sigma), sigma, np.inf)[chosen], np.inf)
+    views = {camera: grid.resample(view.select_frames(chosen)) for camera, view in item.views.items()}
     first = slice(start.frame, start.frame + 1)
     pose = initial.pose if registration.pose_from_model else registration.pose.select_frames(first)
     residual = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - initial.pose.apply(frame.target)
-    residual[frame.measured] = np.where(frame.observed_axes, residual[frame.measured], 0.0)
+    own = frame.along_axes(residual[frame.measured])
+    residual[frame.measured] = np.where(frame.observed_axes, own, 0.0)
     return Trajectory(
-        time,
+        grid.time,
         markers,
         np.isfinite(markers[..., 0]),
         sigma,
@@ -175,6 +180,7 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
             "corrections": recording.corrections,
             "unfit_corrections": recording.unfit_corrections,
         },
+        views,
     )
 
 
@@ -229,19 +235,41 @@ def _marker_velocity(position: Array, sigma: Array, time: Array, start: MotionSt
     return velocity, velocity_sigma
 
 
-def _on_even_grid(
-    recording: Recording, position: Array, sigma: Array, chosen: slice, step: float, row: RecordingRow
-) -> tuple[Array, Array, Array]:
-    """Times, positions and sigma of the chosen frames at even times; dropped frames become gaps."""
-    position, sigma = position[chosen], sigma[chosen]
-    slot = np.rint((recording.time[chosen] - recording.time[chosen.start]) / step).astype(int)
-    if (np.diff(slot) < 1).any():
-        frame = chosen.start + int(np.argmax(np.diff(slot) < 1)) + 1
-        raise InputError(
-            f"recording {row.recording}: expected even frame times, found frame {frame} too early; track it again "
-            "with the true rate (--fps)"
+@dataclass(frozen=True)
+class _EvenGrid:
+    """The even times of a recording.
+
+    Attributes:
+        time: [s], (T).
+        slot: index along T of every recorded frame, (F).
+    """
+
+    time: Array
+    slot: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, time: Array, step: float, first: int, row: RecordingRow) -> "_EvenGrid":
+        """From the times (F) of frames `first` and on, and the time step [s]."""
+        slot = np.rint((time - time[0]) / step).astype(np.int64)
+        if (np.diff(slot) < 1).any():
+            frame = first + int(np.argmax(np.diff(slot) < 1)) + 1
+            raise InputError(
+                f"recording {row.recording}: expected even frame times, found frame {frame} too early; track it again "
+                "with the true rate (--fps)"
+            )
+        return cls(step * np.arange(slot[-1] + 1), slot)
+
+    def fill(self, values: Array, missing: float) -> Array:
+        """Values (F, ..) at the even times, (T, ..); dropped frames become gaps."""
+        result = np.full((len(self.time), *values.shape[1:]), missing)
+        result[self.slot] = values
+        return result
+
+    def resample(self, view: View) -> View:
+        """A view of the recorded frames in the rows of the even times."""
+        return View(
+            view.camera,
+            self.fill(view.pixel, np.nan),
+            self.fill(view.covariance, np.nan),
+            self.fill(view.lag, 0.0),
         )
-    grid = np.full((slot[-1] + 1, *position.shape[1:]), np.nan)
-    grid_sigma = np.full_like(grid, np.inf)
-    grid[slot], grid_sigma[slot] = position, np.where(np.isfinite(position) & np.isfinite(sigma), sigma, np.inf)
-    return step * np.arange(len(grid)), grid, grid_sigma

@@ -99,4 +99,5 @@ def _ordered(recording: Recording, specimen: Specimen, name: str) -> Recording:
     order = [recording.names.index(marker) if marker in recording.names else -1 for marker in layout_names]
     position, sigma = recording.position[:, order].copy(), recording.sigma[:, order].copy()
     position[:, [layout_names.index(marker) for marker in missing]] = np.nan
-    return replace(recording, names=tuple(layout_names), position=position, sigma=sigma)
+    views = {camera: view.select_markers(np.array(order)) for camera, view in recording.views.items()}
+    return replace(recording, names=tuple(layout_names), position=position, sigma=sigma, views=views)

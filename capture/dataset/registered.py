@@ -13,11 +13,12 @@ from rafl.capture.registration.motion_start import MotionStart, find_motion_star
 from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import Registration, average_frames, fit_pose_near_clamp
-from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, pose_sigma
+from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, RigidTransform, pose_sigma
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.markers import Markers
+from rafl.data.views import View, seen_axes
 
 Array = NDArray[Any]
 
@@ -29,6 +30,7 @@ class Registered:
     Attributes:
         recording, row, registration: of which it is made.
         position, sigma: of the specimen's markers [m], (T, M, 3).
+        views: what each camera measured of them, by its name; empty if not known, or if the clamp moves.
         start: where the motion starts, and in which state.
         last: last frame that is used.
     """
@@ -40,6 +42,7 @@ class Registered:
     sigma: Array
     start: MotionStart
     last: int
+    views: dict[str, View]
 
     @classmethod
     def of(
@@ -63,7 +66,12 @@ class Registered:
                 f"recording {row.recording}: expected frames within 0 to {len(recording.time) - 1}, found "
                 f"{start.frame} to {last}; correct recordings.csv"
             )
-        return cls(recording, row, registration, position, sigma, start, last)
+        kept = np.array(
+            [k if name not in registration.outliers else -1 for k, name in enumerate(specimen.layout.names)]
+        )
+        views = {camera: view.select_markers(kept) for camera, view in recording.views.items()}
+        views = _in_frame(views, registration.pose)
+        return cls(recording, row, registration, position, sigma, start, last, views)
 
     def with_pose(self, places: Places) -> "Registered":
         """The recording in the specimen frame, after its pose was found; sigma then contains that of the pose."""
@@ -78,13 +86,18 @@ class Registered:
         position = places.pose.apply(self.position)
         by_pose = pose_sigma(places.pose_covariance, position)
         sigma = np.hypot(places.pose.rotate_sigma(self.sigma), by_pose)
-        return replace(self, registration=registration, position=position, sigma=sigma)
+        views = _in_frame(self.views, places.pose)
+        return replace(self, registration=registration, position=position, sigma=sigma, views=views)
 
     def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
         """Mean marker positions at rest before the release, or those of the first frame."""
         rest = slice(self.start.rest_start, max(self.start.frame, self.start.rest_start + 1))
         target, sigma = average_frames(self.position[rest], self.sigma[rest])
-        name = self.row.recording
+        name, axes = self.row.recording, None
+        if self.views:
+            target, axes, sigma = average_views(
+                {key: view.select_frames(rest) for key, view in self.views.items()}, target
+            )
         if np.isfinite(target[:, 0]).sum() < MIN_MARKERS:
             raise InputError(
                 f"recording {name}, frame {self.start.frame}: expected at least {MIN_MARKERS} markers, found fewer; "
@@ -92,7 +105,51 @@ class Registered:
             )
         surface = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
         nodes = surface if whole_surface else specimen.loaded
-        return FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface)
+        return FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface, axes=axes)
+
+
+def _in_frame(views: dict[str, View], pose: RigidTransform) -> dict[str, View]:
+    """The views with their cameras in the specimen frame; none if the pose differs between frames."""
+    if pose is IDENTITY:
+        return views
+    if pose.rotation.ndim > 2:
+        return {}
+    return {
+        name: replace(view, camera=view.camera.in_frame(pose.rotation, pose.translation))
+        for name, view in views.items()
+    }
+
+
+def average_views(views: dict[str, View], near: Array) -> tuple[Array, Array, Array]:
+    """Positions that the cameras measured on average over some frames, and in which directions.
+
+    Args:
+        views: by camera.
+        near: positions about which the projection is linearised [m], (M, 3), NaN where not known.
+
+    Returns:
+        Positions [m], (M, 3), NaN where no camera saw the marker, and its measured directions as in
+        `rafl.data.views.seen_axes`. In directions that were not measured a position stays near the given one.
+    """
+    means = {}
+    for name, view in views.items():
+        known = np.isfinite(near[:, :1])
+        pixel, sigma = average_frames(view.pixel, np.sqrt(np.diagonal(view.covariance, axis1=-2, axis2=-1)))
+        pixel = np.where(known & np.isfinite(sigma), pixel, np.nan)
+        means[name] = replace(
+            view, pixel=pixel[None], covariance=(sigma**2)[None, ..., None] * np.eye(2), lag=np.zeros(1)
+        )
+    axes, sigma = seen_axes(means, near)
+    target = np.where(np.isfinite(sigma[:, :1]), near, np.nan)
+    # One Gauss-Newton step towards the mean pixels, in the measured directions.
+    step = np.zeros_like(target)
+    for view in means.values():
+        seen = view.seen[0]
+        slope = view.camera.jacobian(near[seen])
+        gap = view.pixel[0, seen] - view.camera.project(near[seen])
+        step[seen] += (slope.swapaxes(1, 2) @ np.linalg.solve(view.covariance[0, seen], gap[..., None]))[..., 0]
+    along = np.where(np.isfinite(sigma), sigma, 0.0) ** 2 * (axes @ step[..., None])[..., 0]
+    return target + (axes.swapaxes(1, 2) @ along[..., None])[..., 0], axes, sigma
 
 
 def find_dataset_places(

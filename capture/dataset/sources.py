@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.calibration.rig import parse_calibration
 from rafl.capture.dataset.c3d import read_c3d
 from rafl.capture.dataset.marker_tables import read_marker_table
 from rafl.capture.registration.recording import Recording
@@ -15,9 +16,12 @@ from rafl.common.errors import InputError
 from rafl.common.files import sha256
 from rafl.common.names import require_names
 from rafl.common.units import METRES
+from rafl.data.views import View
 from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
 from rafl.tracking.reconstruction.corrections import corrections_path
-from rafl.tracking.reconstruction.gap_filling import MISSING
+from rafl.tracking.reconstruction.gap_filling import MEASURED, MISSING
+from rafl.tracking.reconstruction.tracks import Tracks
+from rafl.tracking.reconstruction.triangulation import outlier_limit
 
 Array = NDArray[Any]
 
@@ -113,11 +117,45 @@ def _read(path: Path, fps: float, unit: str | None) -> Recording:
             corrections = f"{applied} of {beside.name} {sha256(beside)}"
         position = np.where((tracks.state == MISSING)[..., None], np.nan, tracks.position)
         return Recording(
-            tracks.names, tracks.time, position, tracks.sigma, None, True, source, corrections, "; ".join(found.unfit)
+            tracks.names,
+            tracks.time,
+            position,
+            tracks.sigma,
+            None,
+            True,
+            source,
+            corrections,
+            "; ".join(found.unfit),
+            _read_views(tracks, path),
         )
     if path.suffix == ".c3d":
         return _read_c3d(path, source)
     return _read_npy(path, fps, source) if path.suffix == ".npy" else _read_table(path, fps, unit, source)
+
+
+def _read_views(tracks: Tracks, path: Path) -> dict[str, View]:
+    """What the cameras of tracks measured: the pixels that agree with the 3-D positions.
+
+    The covariance contains what an orthographic camera leaves out of the perspective.
+    """
+    if not tracks.calibration:
+        return {}
+    rig, views = parse_calibration(tracks.calibration, path), {}
+    if lacking := set(tracks.pixel) - set(rig.cameras):
+        raise InputError(f"{path}: expected the calibration of camera {min(lacking)}, found none; track again")
+    measured = tracks.state == MEASURED
+    seen = {name: measured & np.isfinite(tracks.pixel_sigma[name]).all(axis=2) for name in tracks.pixel}
+    alone = np.sum(list(seen.values()), axis=0) == 1
+    for name, pixel in tracks.pixel.items():
+        camera, sigma = rig.cameras[name], tracks.pixel_sigma[name]
+        by_plane = 0.0 if camera.plane is None else camera.plane.sigma
+        with np.errstate(invalid="ignore"):
+            kept = seen[name] & (tracks.residual[name] <= outlier_limit(sigma, camera))
+            error = camera.model_error(tracks.position, np.where(alone, by_plane, 0.0))
+        variance = np.where(kept[..., None], sigma**2 + error**2, np.nan)
+        covariance = variance[..., None] * np.eye(2)
+        views[name] = View(camera, np.where(kept[..., None], pixel, np.nan), covariance, np.zeros(len(pixel)))
+    return views
 
 
 def _read_table(path: Path, fps: float, unit: str | None, source: str) -> Recording:

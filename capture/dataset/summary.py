@@ -126,6 +126,8 @@ def print_contents(path: Path, console: Console) -> None:
         f"{material.density:g} kg/m3, {material.mass} mass",
         "time": f"{1 / simulator.time_step:g} frames/s, {simulator.integrator}, {simulator.substeps} substeps",
         "markers": f"{len(dataset.markers.names)}: {', '.join(dataset.markers.names)}",
+        "pixels": ", ".join(dict.fromkeys(camera for item in dataset.trajectories.values() for camera in item.views))
+        or "none, positions only",
         "splits": ", ".join(f"{split} {len(dataset.split(split))}" for split in ("train", "val", "test")),
         "units": units,
         "created": f"{created} by {software}",

@@ -1,6 +1,6 @@
 """The first frame: a static equilibrium under virtual forces that match the markers to the recorded ones."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -27,6 +27,7 @@ MAX_ITERATIONS = 100
 FORCE_CHANGE_RATE = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
 # The search ends if a step promises or gives a smaller decrease: relative to the objective, plus absolute.
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-3
+MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
 UNOBSERVED_SIGMA_FACTOR = 10.0  # a larger multiple of the median sigma marks an axis that no camera observed
 
 
@@ -39,10 +40,12 @@ class FirstFrame:
         markers: embedded in its mesh.
         nodes: nodes on which virtual forces act, (L).
         target: recorded marker positions [m], (M, 3), NaN where missing.
-        sigma: of the target [m], (M, 3); equal along all axes if the pose is fitted too.
+        sigma: of the target along `axes` [m], (M, 3), infinite where not measured; equal along all axes if the pose is
+            fitted too.
         recording: name, for messages.
         whole_surface: whether `nodes` are the whole surface, each with an independent force.
         load: known load [kg] that hangs on `nodes`; 0 if the forces are unknown.
+        axes: unit vectors along which every marker was measured, the rows of (M, 3, 3); x, y, z if None.
     """
 
     simulator: Simulator
@@ -53,6 +56,14 @@ class FirstFrame:
     recording: str
     whole_surface: bool = False
     load: float = 0.0
+    axes: Array | None = None
+
+    def along_axes(self, vectors: Array) -> Array:
+        """Components along `axes` of vectors or matrices of the measured markers, (M', 3, ..)."""
+        if self.axes is None:
+            return vectors
+        components: Array = np.einsum("mij,mj...->mi...", self.axes[self.measured], vectors)
+        return components
 
     def expected_force(self) -> Array:
         """Mean of the forces' prior [N], (3 L)."""
@@ -79,9 +90,9 @@ class FirstFrame:
 
     @property
     def observed_axes(self) -> NDArray[np.bool_]:
-        """Which coordinates of the M' measured markers at least one camera observed, (M', 3)."""
+        """Along which axes at least one camera observed the M' measured markers, (M', 3)."""
         sigma = self.sigma[self.measured]
-        return np.asarray(sigma < UNOBSERVED_SIGMA_FACTOR * np.median(sigma))
+        return np.asarray(sigma < UNOBSERVED_SIGMA_FACTOR * np.median(sigma[np.isfinite(sigma)]))
 
 
 @dataclass(frozen=True)
@@ -125,13 +136,44 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
         best = search.minimise(zero, pose or IDENTITY, None)
     else:
         least, little, more = LOCAL_FORCE_SIGMAS
-        first = _LevenbergMarquardt(frame, with_pose, least, 0.0).minimise(zero, pose or IDENTITY, None)
+        # The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose
+        # would: the two can hardly be told apart.
+        with_modulus = not with_pose
+        first = _LevenbergMarquardt(frame, with_pose, least, 0.0, with_modulus).minimise(zero, pose or IDENTITY, None)
         sigma = frame.sigma[frame.measured][frame.observed_axes]
         model_sigma = np.sqrt(max(_rms(frame, first.residual) ** 2 - float((sigma**2).mean()), 0.0))
-        best = _LevenbergMarquardt(frame, with_pose, little, model_sigma).minimise(first.force, first.pose, first.q)
-        trial = _LevenbergMarquardt(frame, with_pose, more, model_sigma).minimise(best.force, best.pose, best.q)
+
+        def refine(local_sigma: float, start: _Estimate) -> _Estimate:
+            search = _LevenbergMarquardt(frame, with_pose, local_sigma, model_sigma, with_modulus)
+            return search.minimise(start.force, start.pose, start.q, start.log_modulus)
+
+        best = refine(little, first)
+        trial = refine(more, best)
         best = trial if _rms(frame, trial.residual) < 0.5 * _rms(frame, best.residual) else best
-    return InitialState(best.q, best.force, np.sqrt(3.0) * _rms(frame, best.residual), best.pose)
+    weight = frame.simulator.weight
+    # With the assumed modulus, the same shape needs forces that are larger by the ratio of the moduli.
+    force = np.exp(-best.log_modulus) * (weight + best.force) - weight
+    return InitialState(best.q, force, np.sqrt(3.0) * _rms(frame, best.residual), best.pose)
+
+
+def _softened(frame: FirstFrame, log_modulus: float) -> FirstFrame:
+    """The frame with another Young's modulus, by the logarithm of its ratio to the assumed one."""
+    if log_modulus == 0.0:
+        return frame
+    material = frame.simulator.material
+    modulus = material.youngs_modulus * float(np.exp(log_modulus))
+    return replace(frame, simulator=replace(frame.simulator, material=replace(material, youngs_modulus=modulus)))
+
+
+def modulus_slope(frame: FirstFrame, q: Array, force: Array) -> Array:
+    """Derivatives of the measured markers by log E at an equilibrium q (N, 3) under forces (N, 3) [m], (M', 3).
+
+    The internal forces are proportional to E, and in equilibrium equal to the weight and the virtual forces.
+    """
+    by_modulus = -frame.simulator.solve_tangent(q[None], (frame.simulator.weight + force)[None])[0]
+    corners = frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()
+    slope: Array = np.einsum("micj,mcj->mi", corners, by_modulus[frame.markers.quad])[frame.measured]
+    return slope
 
 
 @dataclass(frozen=True)
@@ -141,7 +183,7 @@ class LinearFit:
     Attributes:
         force: virtual nodal forces [N], (N, 3).
         q: node positions [m], (N, 3).
-        residual: markers of the mesh minus measured markers [m], (3 M').
+        residual: markers of the mesh minus measured markers along their axes [m], (3 M').
         weight: of the residuals in the objective [1/m], (3 M').
     """
 
@@ -188,10 +230,12 @@ def _rms(frame: FirstFrame, residual: Array) -> float:
 
 @dataclass(frozen=True)
 class _Estimate:
+    frame: FirstFrame  # with a simulator of the modulus that is tried
+    log_modulus: float  # logarithm of that modulus over the assumed one
     force: Array  # [N], (N, 3)
     pose: RigidTransform
     q: Array  # [m], (N, 3)
-    residual: Array  # markers of the mesh minus measured markers in the specimen frame [m], (3 M')
+    residual: Array  # markers of the mesh minus measured markers along their axes [m], (3 M')
     objective: float
 
 
@@ -203,18 +247,27 @@ class _LevenbergMarquardt:
         with_pose: whether the pose is fitted too.
         local_sigma: prior sigma of the local part of the forces [N].
         model_sigma: of the difference between mesh and specimen [m].
+        with_modulus: whether Young's modulus is fitted too, around the assumed one.
     """
 
-    def __init__(self, frame: FirstFrame, with_pose: bool, local_sigma: float, model_sigma: float) -> None:
-        self.frame, self.with_pose = frame, with_pose
+    def __init__(
+        self,
+        frame: FirstFrame,
+        with_pose: bool,
+        local_sigma: float,
+        model_sigma: float,
+        with_modulus: bool = False,
+    ) -> None:
+        self.frame, self.with_pose, self.with_modulus = frame, with_pose, with_modulus
         precision = force_precision(frame, local_sigma)
         self.prior = np.kron(precision, np.eye(3))
         self.expected = frame.expected_force()
         self.weight = 1.0 / np.sqrt(frame.sigma[frame.measured].ravel() ** 2 + model_sigma**2)
 
-    def evaluate(self, force: Array, pose: RigidTransform, start: Array | None) -> _Estimate:
+    def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float) -> _Estimate:
         """Equilibrium, residual and objective, with the solve started at `start` (N, 3) if given."""
-        frame, simulator = self.frame, self.frame.simulator
+        frame = _softened(self.frame, log_modulus)
+        simulator = frame.simulator
         total, label = (simulator.weight + force)[None], f"{frame.recording}: first frame"
         if start is None:
             q = simulator.equilibrium(total, label=label)[0]
@@ -222,13 +275,15 @@ class _LevenbergMarquardt:
             zero = np.zeros(total.shape[:2])
             q = simulator.minimise(start[None], zero, start[None], total, simulator.constitutive_state(1), label)[0]
         positions = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.measured]
-        residual = (positions - pose.apply(frame.target[frame.measured])).ravel()
+        residual = frame.along_axes(positions - pose.apply(frame.target[frame.measured])).ravel()
         f = force[frame.nodes].ravel() - self.expected
-        return _Estimate(force, pose, q, residual, float(((self.weight * residual) ** 2).sum() + f @ self.prior @ f))
+        by_prior = f @ self.prior @ f + (log_modulus / MODULUS_SIGMA) ** 2
+        objective = float(((self.weight * residual) ** 2).sum() + by_prior)
+        return _Estimate(frame, log_modulus, force, pose, q, residual, objective)
 
-    def minimise(self, force: Array, pose: RigidTransform, start: Array | None) -> _Estimate:
-        """Best estimate, from initial forces (N, 3), pose and node positions (N, 3)."""
-        current = self.evaluate(force, pose, start)
+    def minimise(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float = 0.0) -> _Estimate:
+        """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and modulus."""
+        current = self.evaluate(force, pose, start, log_modulus)
         damping, growth = INITIAL_DAMPING, 2.0  # updated as by H. B. Nielsen
         for _ in range(MAX_ITERATIONS):
             gradient, hessian = self._normal_equations(current)
@@ -260,8 +315,11 @@ class _LevenbergMarquardt:
         return RELATIVE_TOLERANCE * current.objective + ABSOLUTE_TOLERANCE
 
     def _normal_equations(self, current: _Estimate) -> tuple[Array, Array]:
-        """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, the pose (6)."""
-        jacobian = marker_jacobian(self.frame, current.q)
+        """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, the pose (6) or log E."""
+        jacobian = marker_jacobian(current.frame, current.q)
+        if self.with_modulus:
+            by_modulus = self.frame.along_axes(modulus_slope(current.frame, current.q, current.force))
+            jacobian = np.concatenate([jacobian, by_modulus.reshape(-1, 1)], axis=1)
         if self.with_pose:
             posed = current.pose.apply(self.frame.target[self.frame.measured])
             jacobian = np.concatenate([jacobian, -pose_jacobian(posed).reshape(-1, 6)], axis=1)
@@ -270,19 +328,25 @@ class _LevenbergMarquardt:
         count = len(self.prior)
         gradient[:count] += self.prior @ (current.force[self.frame.nodes].ravel() - self.expected)
         hessian[:count, :count] += self.prior
+        if self.with_modulus:
+            gradient[-1] += current.log_modulus / MODULUS_SIGMA**2
+            hessian[-1, -1] += MODULUS_SIGMA**-2.0
         return gradient, hessian
 
     def _damping_matrix(self, hessian: Array) -> Array:
         """The prior of the forces; for the pose, which has no prior, a small multiple of its Hessian diagonal."""
         matrix, count = np.diag(1e-6 * np.diag(hessian)), len(self.prior)
         matrix[:count, :count] = self.prior
+        if self.with_modulus:
+            matrix[-1, -1] = MODULUS_SIGMA**-2.0
         return matrix
 
     def _take_step(self, current: _Estimate, step: Array) -> _Estimate:
         force, count = current.force.copy(), len(self.prior)
         force[self.frame.nodes] += step[:count].reshape(-1, 3)
-        pose = current.pose.followed_by(step[count:]) if self.with_pose else current.pose
-        return self.evaluate(force, pose, current.q)
+        pose = current.pose.followed_by(step[count : count + 6]) if self.with_pose else current.pose
+        log_modulus = current.log_modulus + float(step[-1]) if self.with_modulus else current.log_modulus
+        return self.evaluate(force, pose, current.q, log_modulus)
 
 
 def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> Array:
@@ -294,13 +358,17 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
         velocity, sigma: velocities of the markers and their sigmas [m/s], (M, 3); NaN and infinite if unknown.
     """
     jacobian = marker_jacobian(frame, q)
-    known = np.isfinite(velocity[frame.measured]).ravel() & np.isfinite(sigma[frame.measured]).ravel()
-    weight = 1.0 / sigma[frame.measured].ravel()[known]
+    velocity = frame.along_axes(np.where(np.isfinite(velocity), velocity, 0.0)[frame.measured]).ravel()
+    if frame.axes is not None:
+        sigma = np.where(np.isfinite(frame.sigma), np.sqrt((frame.axes**2 @ sigma[..., None] ** 2)[..., 0]), np.inf)
+    sigma = sigma[frame.measured].ravel()
+    known = np.isfinite(sigma)
+    weight = 1.0 / sigma[known]
     weighted = weight[:, None] * jacobian[known]
     local = SURFACE_FORCE_SIGMA if frame.whole_surface else LOCAL_FORCE_SIGMAS[1]
     precision = force_precision(frame, local)
     prior = np.kron(precision, np.eye(3)) / FORCE_CHANGE_RATE**2
-    gradient = weighted.T @ (weight * velocity[frame.measured].ravel()[known])
+    gradient = weighted.T @ (weight * velocity[known])
     force_rate = np.zeros_like(q)
     force_rate[frame.nodes] = np.linalg.solve(weighted.T @ weighted + prior, gradient).reshape(-1, 3)
     return np.asarray(frame.simulator.solve_tangent(q[None], force_rate[None])[0])
@@ -323,9 +391,12 @@ def linear_modes(positions: Array) -> Array:
 
 
 def marker_jacobian(frame: FirstFrame, q: Array) -> Array:
-    """Derivatives of the measured markers by the forces on the nodes [m/N], (3 M', 3 L), at equilibrium q (N, 3)."""
+    """Derivatives of the measured markers, along their axes, by the forces on the nodes [m/N], (3 M', 3 L).
+
+    q: equilibrium [m], (N, 3).
+    """
     measured = np.flatnonzero(frame.measured)
-    by_corner = frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()[measured]  # (M', 3, 4, 3)
+    by_corner = frame.along_axes(frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()[measured])  # (M', 3, 4, 3)
     rows = np.zeros((len(measured), 3, *q.shape))
     for corner in range(4):
         rows[np.arange(len(measured)), :, frame.markers.quad[measured, corner]] += by_corner[:, :, corner]

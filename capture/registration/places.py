@@ -7,21 +7,27 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rafl.capture.registration.initial import FirstFrame, LinearFit, fit_linear_forces, linear_jacobian
+from rafl.capture.registration.initial import (
+    MODULUS_SIGMA,
+    FirstFrame,
+    LinearFit,
+    fit_linear_forces,
+    linear_jacobian,
+    modulus_slope,
+)
 from rafl.capture.registration.rigid import RigidTransform, pose_jacobian
 from rafl.data.markers import Markers, embed
 
 Array = NDArray[Any]
 
-MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
 MIN_PRIOR_SIGMA = 1e-8  # of a place that is exactly known [m]
 MAX_MODULUS_STEP = 0.3  # of log E in one iteration
 MAX_ITERATIONS = 10
-# The search ends with a smaller change of every place [m], of log E, and of the pose [rad, m].
-STEP_TOLERANCE, MODULUS_TOLERANCE, POSE_TOLERANCE = 1e-6, 1e-3, 1e-5
 # The mesh follows the shape of a bent specimen to about this fraction of its deflection, and not closer than this
 # distance [m]. The error is alike in all recordings, so that more of them do not average it out.
 MODEL_FRACTION, MIN_MODEL_SIGMA = 0.01, 1e-5
+# The search ends with a smaller change of every place [m], of log E, and of the pose [rad, m].
+STEP_TOLERANCE, MODULUS_TOLERANCE, POSE_TOLERANCE = 1e-6, 1e-3, 1e-5
 
 
 @dataclass(frozen=True)
@@ -127,12 +133,10 @@ def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, posed: bool) ->
         whole[3 * m : 3 * m + 3, 7 + 3 * m : 10 + 3 * m] = own
     if posed:
         whole[:, 1:7] = -pose_jacobian(frame.target).reshape(-1, 6)
-    # The internal forces are proportional to E, and in equilibrium equal to the weight and the virtual forces.
-    by_modulus = -frame.simulator.solve_tangent(fit.q[None], (frame.simulator.weight + fit.force)[None])[0]
-    corners = frame.markers.corner_jacobian(q).numpy()
-    whole[:, 0] = np.einsum("micj,mcj->mi", corners, by_modulus[frame.markers.quad]).ravel()
+    whole[rows, 0] = modulus_slope(frame, fit.q, fit.force).ravel()
     shared = np.zeros((len(residual), whole.shape[1]))
-    shared[: len(rows)] = fit.weight[:, None] * whole[rows]
+    by_axis = frame.along_axes(whole[rows].reshape(-1, 3, whole.shape[1])).reshape(len(rows), -1)
+    shared[: len(rows)] = fit.weight[:, None] * by_axis
     # What the forces can explain is taken out.
     basis = np.linalg.qr(local)[0]
     shared -= basis @ (basis.T @ shared)

@@ -1,9 +1,11 @@
 """Marker positions of one recording before its registration to a specimen."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from numpy.typing import NDArray
+
+from rafl.data.views import View
 
 Array = NDArray[Any]
 
@@ -22,6 +24,7 @@ class Recording:
         source: file name and SHA-256.
         corrections: how many corrections by a person the positions contain, their file and its SHA-256.
         unfit_corrections: those that do not fit the tracks and were left out.
+        views: what each camera measured, by its name, with the camera in the frame of the file; empty if not known.
     """
 
     names: tuple[str, ...] | None
@@ -33,3 +36,4 @@ class Recording:
     source: str
     corrections: str = ""
     unfit_corrections: str = ""
+    views: dict[str, View] = field(default_factory=dict)

@@ -32,7 +32,8 @@ def fit_by_sequence(frame: FirstFrame, iterations: int = ITERATIONS) -> InitialS
     start = Start(rest, zero, zero, zero[..., 0], (frame.recording,))
     measured = torch.from_numpy(frame.measured)
     target, weight = (torch.from_numpy(x[frame.measured]) for x in (frame.target, frame.sigma))
-    weight = (weight.median() / weight) ** 2
+    weight = (weight[weight.isfinite()].median() / weight) ** 2
+    axes = torch.from_numpy(frame.axes[frame.measured]) if frame.axes is not None else torch.eye(3, dtype=torch.float64)
     sequence = torch.zeros((SIMULATION_STEPS, len(nodes), 3), dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.Adam([sequence], lr=LEARNING_RATE)
     best = np.inf
@@ -45,7 +46,7 @@ def fit_by_sequence(frame: FirstFrame, iterations: int = ITERATIONS) -> InitialS
 
         optimiser.zero_grad()
         q = rollout(simulator, start, SIMULATION_STEPS, external_force)[0][:, 0]
-        residual = frame.markers.positions(q[-MATCHED_STEPS:])[:, measured] - target
+        residual = (axes @ (frame.markers.positions(q[-MATCHED_STEPS:])[:, measured] - target)[..., None])[..., 0]
         loss = LOSS_SCALE * ((weight * residual**2).sum() + FORCE_PENALTY * (sequence**2).sum()) / MATCHED_STEPS
         if loss.item() < best:
             best = loss.item()
@@ -53,6 +54,6 @@ def fit_by_sequence(frame: FirstFrame, iterations: int = ITERATIONS) -> InitialS
             found = (q[-1].detach().clone(), force)
         torch.autograd.backward(loss)
         optimiser.step()
-    final = (frame.markers.positions(found[0])[measured] - target).numpy()[frame.observed_axes]
+    final = frame.along_axes((frame.markers.positions(found[0])[measured] - target).numpy())[frame.observed_axes]
     rms_distance = float(np.sqrt((final**2).mean() * 3.0))
     return InitialState(found[0].numpy(), found[1].numpy(), rms_distance, IDENTITY)

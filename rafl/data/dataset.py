@@ -1,7 +1,7 @@
 """One specimen's mesh, markers and recorded trajectories."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from rafl.common.arrays import ArrayFormat, check_shape, check_values
 from rafl.common.names import check_distinct, check_names, check_visible
 from rafl.data.markers import Markers
+from rafl.data.views import VIEW_ARRAYS, View
 from rafl.simulation.rollout import Start
 from rafl.simulation.simulator import Simulator
 
@@ -20,6 +21,7 @@ SPLITS = ("train", "val", "test")
 THROUGH_MODEL = "through the model"  # begins the description of a registration that rests on the assumed material
 # Largest relative error of frame times against an even time grid, and of one recording's time step against another's.
 MAX_RELATIVE_TIME_ERROR = 5e-3
+MAX_LAG = 1.0  # of a camera's measurement to its row [frames]
 # The arrays of a dataset and of its file. N: nodes, E: elements, F: fixed nodes, M: markers, T: frames.
 MESH_ARRAYS = {
     "vertices": ArrayFormat(("N", 3)),
@@ -60,6 +62,7 @@ class Trajectory:
         added_mass: attached mass that moves with the nodes [kg], (N).
         split: `train`, `val` or `test`.
         attributes: plain values for readers of the file: load_g, registration, fit residual, sources.
+        views: what each camera measured, by its name; empty where only positions are known.
     """
 
     time: Array
@@ -73,6 +76,13 @@ class Trajectory:
     added_mass: Array
     split: str
     attributes: dict[str, object] = field(default_factory=dict)
+    views: dict[str, View] = field(default_factory=dict)
+
+    def first_frames(self, frames: int) -> "Trajectory":
+        """The recording with only its leading frames."""
+        arrays = {key: getattr(self, key)[:frames] for key in ("time", "markers", "valid", "sigma")}
+        views = {name: view.select_frames(slice(frames)) for name, view in self.views.items()}
+        return replace(self, **arrays, views=views)
 
 
 @dataclass(frozen=True)
@@ -168,6 +178,13 @@ class Dataset:
         _require(bool(np.isfinite(observed).all()), f"{label}/markers", "finite positions where valid")
         _require(bool((item.sigma[item.valid] > 0).all()), f"{label}/sigma", "more than 0 where valid")
         _require(item.split in SPLITS, f"{label}, split", f"{', '.join(SPLITS)}, found {item.split!r}")
+        check_names(item.views)
+        for camera, view in item.views.items():
+            own = f"{label}/views/{camera}"
+            _check_arrays(f"{own}/", vars(view), VIEW_ARRAYS, {**lengths, "T": frames})
+            view.check(own)
+            near = np.abs(view.lag) <= MAX_LAG * self.simulator.time_step
+            _require(bool(near.all()), f"{own}/lag", f"times within {MAX_LAG:g} frames of the recording's")
 
 
 def _check_arrays(

@@ -12,6 +12,7 @@ import numpy as np
 import pydantic
 from numpy.typing import NDArray
 
+from rafl.calibration.rig import Rig, parse_calibration, rig_text
 from rafl.common.arrays import ArrayFormat, read_arrays
 from rafl.common.errors import InputError
 from rafl.common.hdf5_files import read_hdf5, write_hdf5
@@ -28,6 +29,7 @@ from rafl.data.dataset import (
     Trajectory,
 )
 from rafl.data.markers import Markers
+from rafl.data.views import VIEW_ARRAYS, View
 from rafl.fem.laws import LAWS
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
@@ -35,10 +37,11 @@ from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-FORMAT = "rafl-dataset/1"
+FORMAT = "rafl-dataset/2"  # 2: with views
 UNITS = "SI: m, s, kg, N, Pa; specimen frame: origin at a corner of the clamped face, x to the tip, z up"
 SPECIMEN_GROUPS = ("mesh", "material", "markers")  # groups that all recordings share
 HASH_ATTRIBUTE = "sha256"
+CALIBRATION = "calibration"  # of a recording's views: the cameras as in calib.yaml, in the specimen frame
 LABEL, ADVICE = "a dataset written by rafl-capture", "build it again"  # in messages about unreadable files
 # Unit and frame of every array, by its name. The hashes cover these texts: changing one breaks updates of older files.
 UNITS_AND_FRAMES = {
@@ -60,6 +63,9 @@ UNITS_AND_FRAMES = {
     "q": ("m", "specimen; first frame"),
     "v": ("m/s", "specimen; first frame"),
     "virtual_force": ("N", "specimen; first frame"),
+    "pixel": ("px", "image; (0, 0) is the centre of its first pixel"),
+    "covariance": ("px2", "image"),
+    "lag": ("s", "from the row's time on"),
 }
 
 
@@ -144,6 +150,12 @@ def _write(file: h5py.File, dataset: Dataset, recipe: str) -> None:
             _write_array(file, f"trajectories/{name}/{key}", getattr(item, key))
         for key in INITIAL_ARRAYS:
             _write_array(file, f"trajectories/{name}/initial/{key}", getattr(item, key))
+        for camera, view in item.views.items():
+            for key in VIEW_ARRAYS:
+                _write_array(file, f"trajectories/{name}/views/{camera}/{key}", getattr(view, key))
+        if item.views:
+            rig = Rig({camera: view.camera for camera, view in item.views.items()})
+            file[f"trajectories/{name}/views"].attrs[CALIBRATION] = rig_text(rig)
         file[f"trajectories/{name}"].attrs.update({"split": item.split, **item.attributes})
     for group in (*(file[part] for part in SPECIMEN_GROUPS), *file["trajectories"].values()):
         group.attrs[HASH_ATTRIBUTE] = _digest(group)
@@ -294,7 +306,19 @@ def _read_trajectory(group: h5py.Group, lengths: dict[str, int], label: str) -> 
         **read_arrays(group["initial"], INITIAL_ARRAYS, lengths, f"{label}initial/"),
         split=attributes.pop("split"),
         attributes=attributes,
+        views=_read_views(group["views"], lengths, f"{label}views/") if "views" in group else {},
     )
+
+
+def _read_views(group: h5py.Group, lengths: dict[str, int], label: str) -> dict[str, View]:
+    """The views of a recording, by camera."""
+    rig = parse_calibration(str(group.attrs[CALIBRATION]), Path(group.file.filename))
+    if set(rig.cameras) != set(group):
+        raise ValueError(f"{label}: expected the cameras {', '.join(rig.cameras)}, found {', '.join(group)}")
+    return {
+        name: View(camera, **read_arrays(group[name], VIEW_ARRAYS, lengths, f"{label}{name}/"))
+        for name, camera in rig.cameras.items()
+    }
 
 
 def _attributes(group: h5py.Group) -> dict[str, Any]:

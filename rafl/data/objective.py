@@ -1,19 +1,68 @@
-"""The training loss and the reported error between simulations and recordings."""
+"""The training loss and the reported error between simulations and recordings.
+
+A recording that holds what the cameras measured is compared in the image plane, at the times of the cameras: there
+nothing need be assumed about the depth of a marker that one camera saw. Others are compared in space, as in the paper.
+"""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rafl.data.dataset import Dataset
+from rafl.calibration.camera import Camera
+from rafl.common.errors import InputError
+from rafl.data.dataset import Dataset, Trajectory
+from rafl.data.views import MIN_ANGLE, View, at_lags, project, project_slope
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.rollout import ResidualForce, rollout
 from rafl.simulation.simulator import Simulator
 
 LOSS_SCALE = 1e3
 MIN_RELATIVE_SIGMA = 0.2  # of the median sigma: limits a weight to 25 times the usual one
+# In the image plane a residual beyond this share of the recording's motion (root mean square) counts linearly, no
+# longer squared (Huber's loss): a marker that took its neighbour's dot does not decide the fit.
+HUBER_SHARE = 0.5
+MIN_HUBER_SIGMAS = 10.0  # the same limit is at least so many reference sigmas, for bodies that hardly move
+
+Objective = Literal["", "image", "3d"]  # empty: in the image plane where a dataset has views
+
+
+@dataclass(frozen=True)
+class CameraTerm:
+    """What one camera measured of B recordings, padded to the longest.
+
+    Attributes:
+        cameras: in the specimen frame of each recording, (B).
+        pixel: (T, B, M, 2) [px], zero where not seen.
+        root: inverse square root of the pixels' covariances times the dataset's reference sigma [m/px], (T, B, M, 2,
+            2), zero where not seen. It turns a difference of pixels into a distance in the body.
+        lag: of the measurements [time steps], (T, B).
+        scale: of the image at the markers [px/m], (T, B, M); 1 where not seen.
+    """
+
+    cameras: list[Camera]
+    pixel: Tensor
+    root: Tensor
+    lag: Tensor
+    scale: Tensor
+
+    @property
+    def seen(self) -> Tensor:
+        """1 where the camera saw a marker, else 0, (T, B, M)."""
+        return (self.root[..., 0, 0] != 0.0).to(self.pixel.dtype)
+
+    def index(self, frames: slice, recordings: list[int] | slice, markers: NDArray[np.int64] | slice) -> "CameraTerm":
+        """The measurements of some frames, recordings and markers."""
+        chosen = {key: getattr(self, key)[frames][:, recordings][:, :, markers] for key in ("pixel", "root", "scale")}
+        cameras = self.cameras[recordings] if isinstance(recordings, slice) else [self.cameras[b] for b in recordings]
+        return CameraTerm(cameras, lag=self.lag[frames][:, recordings], **chosen)
+
+    def gap(self, markers: Tensor) -> Tensor:
+        """Simulated minus measured pixels, (T, B, M, 2), of simulated markers (T, B, M, 3) [m]."""
+        return project(at_lags(markers, self.lag), self.cameras) - self.pixel
 
 
 @dataclass(frozen=True)
@@ -26,6 +75,9 @@ class Recordings:
         markers: positions [m], (T, B, M, 3), zero where not valid.
         valid: 1 where a marker was observed, else 0, (T, B, M).
         weight: of each coordinate in the loss, `valid` or by sigma, (T, B, M, 3).
+        terms: what the cameras measured, by camera; empty if positions are compared.
+        limit: squared difference from which on it counts linearly in the loss [m^2], (B); infinite if positions are
+            compared.
     """
 
     dataset: Dataset
@@ -33,10 +85,22 @@ class Recordings:
     markers: Tensor
     valid: Tensor
     weight: Tensor
+    terms: dict[str, CameraTerm]
+    limit: Tensor
 
     @classmethod
-    def of(cls, dataset: Dataset, names: list[str], by_sigma: bool = False) -> "Recordings":
-        """Stack the named recordings. `by_sigma` weights coordinates by 1 / sigma^2, relative to the median sigma."""
+    def of(cls, dataset: Dataset, names: list[str], by_sigma: bool = False, objective: Objective = "") -> "Recordings":
+        """Stack the named recordings.
+
+        Args:
+            dataset: that holds them.
+            names: of the recordings.
+            by_sigma: weight positions by 1 / sigma^2, relative to the median sigma. Pixels always are.
+            objective: what the loss compares. Errors are those of what was seen in any case.
+
+        Raises:
+            InputError: pixels shall be compared, and a recording has none.
+        """
         items = [dataset.trajectories[name] for name in names]
         frames = max(len(item.time) for item in items)
         count = len(dataset.markers.names)
@@ -49,7 +113,26 @@ class Recordings:
             valid[: len(item.time), b] = item.valid
             own = (median / np.maximum(item.sigma, MIN_RELATIVE_SIGMA * median)) ** 2 if by_sigma else 1.0
             weight[: len(item.time), b] = item.valid[..., None] * own
-        return cls(dataset, names, *(torch.from_numpy(array) for array in (markers, valid, weight)))
+        with_views = all(item.views for item in items)
+        if objective == "image" and not with_views:
+            lacking = next(name for name, item in zip(names, items, strict=True) if not item.views)
+            raise InputError(
+                f"{dataset.name}, recording {lacking}: expected the pixels that its cameras measured, found positions "
+                "only; build the dataset again from tracks, or compare positions with --objective 3d"
+            )
+        stacked = [torch.from_numpy(array) for array in (markers, valid, weight)]
+        infinite = torch.full((len(names),), torch.inf, dtype=torch.float64)
+        found = cls(dataset, names, stacked[0], stacked[1], stacked[2], {}, infinite)
+        if not with_views:
+            return found
+        reference = _reference_sigma(dataset)
+        least = torch.tensor((MIN_HUBER_SIGMAS * reference) ** 2, dtype=torch.float64)
+        limit = torch.maximum(HUBER_SHARE**2 * torch.from_numpy(found.square_motion), least)
+        return replace(
+            found,
+            terms=_camera_terms(dataset, items, frames, reference),
+            limit=infinite if objective == "3d" else limit,
+        )
 
     def in_simulator(self, simulator: Simulator) -> "Recordings":
         """The same recordings with another simulator."""
@@ -58,18 +141,29 @@ class Recordings:
 
     def select(self, chosen: list[int]) -> "Recordings":
         """The recordings of the given indices."""
-        arrays = {key: getattr(self, key)[:, chosen] for key in ("markers", "valid", "weight")}
-        return replace(self, names=[self.names[k] for k in chosen], **arrays)
+        part = self._index(slice(None), chosen, slice(None))
+        return replace(part, names=[self.names[k] for k in chosen], limit=self.limit[chosen])
 
     def select_markers(self, chosen: NDArray[np.int64]) -> "Recordings":
         """The same recordings with only the given rows of markers."""
-        dataset = replace(self.dataset, markers=self.dataset.markers.select(chosen))
-        arrays = (array[:, :, chosen] for array in (self.markers, self.valid, self.weight))
-        return Recordings(dataset, self.names, *arrays)
+        part = self._index(slice(None), slice(None), chosen)
+        return replace(part, dataset=replace(self.dataset, markers=self.dataset.markers.select(chosen)))
 
     def first_frames(self, frames: int) -> "Recordings":
         """The leading `frames` frames of the same recordings."""
-        return replace(self, **{key: getattr(self, key)[:frames] for key in ("markers", "valid", "weight")})
+        return self._index(slice(frames), slice(None), slice(None))
+
+    def _index(self, frames: slice, recordings: list[int] | slice, markers: NDArray[np.int64] | slice) -> "Recordings":
+        arrays = {
+            key: getattr(self, key)[frames][:, recordings][:, :, markers] for key in ("markers", "valid", "weight")
+        }
+        terms = {name: term.index(frames, recordings, markers) for name, term in self.terms.items()}
+        return replace(self, **arrays, terms=terms)
+
+    @property
+    def in_image(self) -> bool:
+        """Whether the loss compares pixels, not positions."""
+        return bool(self.limit.isfinite().all())
 
     @property
     def square_motion(self) -> NDArray[np.float64]:
@@ -78,6 +172,20 @@ class Recordings:
         square = (self.markers - self.markers[0]).square().sum(-1) * seen
         mean: NDArray[np.float64] = (square.sum((0, 2)) / seen.sum((0, 2)).clamp_min(1.0)).numpy()
         return mean
+
+    @property
+    def observed(self) -> Tensor:
+        """1 where a marker was observed, else 0, (T, B, M)."""
+        if not self.terms:
+            return self.valid
+        return torch.stack([term.seen for term in self.terms.values()]).amax(0)
+
+    @property
+    def observed_coordinates(self) -> float:
+        """Number of coordinates after the first frame that the loss compares."""
+        if self.in_image:
+            return sum(2.0 * float(term.seen[1:].sum()) for term in self.terms.values())
+        return float((self.weight[1:] > 0).sum())
 
     def simulate(
         self, residual: ResidualForce | None = None, parameters: Parameters | None = None
@@ -93,11 +201,106 @@ class Recordings:
         steps = len(self.markers) - 1
         return rollout(self.dataset.simulator, self.dataset.start(self.names), steps, residual, parameters)
 
+    def gaps(self, simulated: Tensor) -> list[Tensor]:
+        """Weighted differences of simulated markers (T, B, M, 3) from what was measured [m], (T, B, M, D) each.
+
+        One of three coordinates, or for every camera one of two.
+        """
+        if not self.in_image:
+            return [(simulated - self.markers) * self.weight.sqrt()]
+        return [(term.root @ term.gap(simulated)[..., None])[..., 0] for term in self.terms.values()]
+
+    def gap_slopes(self, simulated: Tensor, slope: Tensor) -> list[Tensor]:
+        """Derivatives of `gaps` in some directions, (T, n, B, M, D) each; slope of the markers (T, n, B, M, 3)."""
+        if not self.in_image:
+            return [slope * self.weight.sqrt()[:, None]]
+        result = []
+        for term in self.terms.values():
+            lagging = at_lags(simulated, term.lag)
+            own = torch.stack([at_lags(slope[:, k], term.lag) for k in range(slope.shape[1])], dim=1)
+            change = project_slope(lagging, term.cameras)[:, None] @ own[..., None]
+            result.append((term.root[:, None] @ change)[..., 0])
+        return result
+
+    def seen_directions(self, frame: int) -> Tensor:
+        """Projections (B, M, 3, 3) onto the directions in which a frame's markers were measured; zero if in none."""
+        if not self.in_image:
+            return self.valid[frame][..., None, None] * torch.eye(3, dtype=torch.float64)
+        information = torch.zeros((*self.valid[frame].shape, 3, 3), dtype=torch.float64)
+        for term in self.terms.values():
+            slope = project_slope(self.markers[frame][None], term.cameras)[0] / term.scale[frame][..., None, None]
+            information += (term.seen * self.valid)[frame][..., None, None] * (slope.mT @ slope)
+        values, vectors = torch.linalg.eigh(information)
+        known = (values > MIN_ANGLE**2 * values[..., 1:2]) & (values[..., 1:2] > 0.0)
+        projection: Tensor = vectors @ (known[..., None] * vectors.mT)
+        return projection
+
 
 def _median_sigma(dataset: Dataset) -> float:
     """Median over all observed coordinates of a dataset [m]."""
     sigma = np.concatenate([item.sigma[item.valid].ravel() for item in dataset.trajectories.values()])
     return float(np.median(sigma[np.isfinite(sigma)]))
+
+
+def _scale(view: View, markers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Scale of the image at markers (T, M, 3) [px/m], (T, M)."""
+    slope = view.camera.jacobian(markers)
+    scale: NDArray[np.float64] = np.linalg.det(slope @ slope.swapaxes(-1, -2)) ** 0.25
+    return scale
+
+
+def _image_sigma(view: View) -> NDArray[np.float64]:
+    """Standard deviation of a pixel, the geometric mean of both directions [px], (T, M); NaN where not seen."""
+    with np.errstate(invalid="ignore"):
+        sigma: NDArray[np.float64] = np.linalg.det(view.covariance) ** 0.25
+    return sigma
+
+
+def _reference_sigma(dataset: Dataset) -> float:
+    """Median over a dataset of the pixels' sigmas, as distances in the body [m]."""
+    sigmas = [
+        (_image_sigma(view) / _scale(view, _known(item)))[view.seen]
+        for item in dataset.trajectories.values()
+        for view in item.views.values()
+    ]
+    return float(np.median(np.concatenate(sigmas)))
+
+
+def _camera_terms(dataset: Dataset, items: list[Trajectory], frames: int, reference: float) -> dict[str, CameraTerm]:
+    """What the cameras measured of some recordings, by camera; `reference` as `_reference_sigma`.
+
+    A camera that did not film a recording saw nothing of it. A sigma of less than a fifth of the reference counts as
+    that.
+    """
+    count = len(dataset.markers.names)
+    result = {}
+    for name in dict.fromkeys(name for item in items for name in item.views):
+        pixel, root = np.zeros((frames, len(items), count, 2)), np.zeros((frames, len(items), count, 2, 2))
+        lag, scale = np.zeros((frames, len(items))), np.ones((frames, len(items), count))
+        cameras = []
+        for b, item in enumerate(items):
+            view = item.views.get(name)
+            cameras.append(next(iter(item.views.values())).camera if view is None else view.camera)
+            if view is None:
+                continue
+            length, seen = len(item.time), view.seen
+            own = _scale(view, _known(item))
+            least = (MIN_RELATIVE_SIGMA * reference * own) ** 2
+            values, vectors = np.linalg.eigh(np.where(seen[..., None, None], view.covariance, np.eye(2)))
+            inverse = reference / np.sqrt(np.maximum(values, least[..., None]))
+            whitening = (vectors * inverse[..., None, :]) @ vectors.swapaxes(-1, -2)
+            root[:length, b] = np.where(seen[..., None, None], whitening, 0.0)
+            pixel[:length, b] = np.where(seen[..., None], view.pixel, 0.0)
+            lag[:length, b] = view.lag / dataset.simulator.time_step
+            scale[:length, b] = own
+        result[name] = CameraTerm(cameras, *(torch.from_numpy(array) for array in (pixel, root, lag, scale)))
+    return result
+
+
+def _known(item: Trajectory) -> NDArray[np.float64]:
+    """Positions (T, M, 3) [m]; the mean of the known ones where one is not known."""
+    middle = item.markers[item.valid].mean(axis=0)
+    return np.where(item.valid[..., None], item.markers, middle)
 
 
 def training_loss(recordings: Recordings, simulated: Tensor, forces: Tensor, force_penalty: float = 0.0) -> Tensor:
@@ -112,38 +315,69 @@ def training_loss(recordings: Recordings, simulated: Tensor, forces: Tensor, for
 
 
 def recording_losses(recordings: Recordings, simulated: Tensor) -> Tensor:
-    """`training_loss` of every recording without the forces, (B)."""
-    gap = (simulated - recordings.markers)[1:] ** 2 * recordings.weight[1:]
-    return LOSS_SCALE * gap.sum((0, 2, 3)) / _observed_steps(recordings)
+    """`training_loss` of every recording without the forces, (B).
+
+    In the image plane |x - x_bar|^2 becomes, for every camera, the squared difference of the pixels by their inverse
+    covariance, times the squared reference sigma, under Huber's loss (P. J. Huber, Robust Statistics, 1981).
+    """
+    limit = recordings.limit[None, :, None]
+    finite = torch.where(limit.isfinite(), limit, 0.0)  # the slope of the branch that is not taken must be finite too
+    total = torch.zeros(len(recordings.names), dtype=torch.float64)
+    for gap in recordings.gaps(simulated):
+        square = gap[1:].square().sum(-1)
+        far = square > limit
+        beyond = 2.0 * torch.where(far, finite * square, 1.0).sqrt() - finite
+        total = total + torch.where(far, beyond, square).sum((0, 2))
+    return LOSS_SCALE * total / _observed_steps(recordings)
 
 
 def _observed_steps(recordings: Recordings) -> Tensor:
     """Number of steps of every recording with an observed marker, at least 1, (B)."""
-    return recordings.valid[1:].amax(-1).sum(0).clamp_min(1.0)
+    return recordings.observed[1:].amax(-1).sum(0).clamp_min(1.0)
 
 
-def loss_curvature(recordings: Recordings, slope: Tensor) -> Tensor:
-    """Gauss-Newton matrix (n, n) of `training_loss` without a penalty; slope of the markers (T, n, B, M, 3) [m]."""
+def loss_curvature(recordings: Recordings, simulated: Tensor, slope: Tensor) -> Tensor:
+    """Gauss-Newton matrix (n, n) of `training_loss` without a penalty.
+
+    Args:
+        recordings: that are compared.
+        simulated: markers [m], (T, B, M, 3).
+        slope: their derivatives in n directions [m], (T, n, B, M, 3).
+    """
     steps = _observed_steps(recordings)
-    weight = recordings.weight[1:] / steps[:, None, None]
-    products = torch.einsum("tkbmi,tlbmi,tbmi->kl", slope[1:], slope[1:], weight)
+    limit = recordings.limit[None, :, None]
+    products = torch.zeros((slope.shape[1],) * 2, dtype=torch.float64)
+    slopes = recordings.gap_slopes(simulated, slope)
+    for gap, own in zip(recordings.gaps(simulated), slopes, strict=True):
+        square = gap[1:].square().sum(-1)
+        far = square > limit
+        share = torch.where(far, torch.where(far, limit, 1.0) / square.clamp_min(1e-300), 1.0).sqrt()
+        products += torch.einsum("tkbmi,tlbmi,tbm->kl", own[1:], own[1:], share / steps[:, None])
     return 2.0 * LOSS_SCALE * products / len(steps)
 
 
 def frame_errors(recordings: Recordings, simulated: Tensor) -> list[NDArray[np.float64]]:
     """For each recording, the mean distance of the observed markers in every frame with any [m], (T_r).
 
-    Its average over frames and recordings is the paper's error (eq. sim2real_evaluation).
+    Of a marker that several cameras saw it is the distance in space; of one that a single camera saw, the distance in
+    the image divided by the scale there; in recordings of positions, the distance in space. Its average over frames and
+    recordings is the paper's error (eq. sim2real_evaluation).
     """
-    valid = recordings.valid
-    distance = torch.linalg.norm(simulated - recordings.markers, dim=-1) * valid
-    observed = valid.sum(-1)
-    mean = (distance.sum(-1) / observed.clamp_min(1.0)).detach().numpy()
-    counts = [observed[:, b] for b in range(observed.shape[1])]
-    return [mean[: int(count.nonzero().max()) + 1, b][_observed_rows(count)] for b, count in enumerate(counts)]
+    observed = recordings.observed
+    distance = torch.linalg.norm(simulated - recordings.markers, dim=-1)
+    if recordings.terms:
+        count = torch.stack([term.seen for term in recordings.terms.values()]).sum(0)
+        in_image = torch.zeros_like(distance)
+        for term in recordings.terms.values():
+            in_image += term.seen * torch.linalg.norm(term.gap(simulated), dim=-1) / term.scale
+        distance = torch.where((count > 1) & (recordings.valid > 0), distance, in_image / count.clamp_min(1.0))
+    distance = distance * observed
+    total = observed.sum(-1)
+    mean = (distance.sum(-1) / total.clamp_min(1.0)).detach().numpy()
+    return [mean[rows, b] for b, rows in enumerate(observed_frames(recordings))]
 
 
-def _observed_rows(observed: Tensor) -> NDArray[np.bool_]:
-    """Whether each frame up to the last observed one has an observed marker, from the counts (T)."""
-    frames = int(observed.nonzero().max()) + 1
-    return (observed[:frames] > 0).numpy()
+def observed_frames(recordings: Recordings) -> list[NDArray[np.int64]]:
+    """For each recording, the frames in which a marker was observed, (T_r)."""
+    seen = recordings.observed.amax(-1).numpy() > 0
+    return [np.flatnonzero(column) for column in seen.T]

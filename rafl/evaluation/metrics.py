@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import SPLITS, Dataset
-from rafl.data.objective import Recordings, frame_errors
+from rafl.data.objective import Recordings, frame_errors, observed_frames
 from rafl.data.strain_range import StrainRange
 from rafl.evaluation.oscillation import fit_oscillation, most_active_coordinate, rest_position_error
 from rafl.fem.mesh import HexMesh
@@ -76,10 +76,9 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
             if force.numel():
                 magnitudes[method] = torch.linalg.norm(force, dim=-1).numpy()
             errors[method] = frame_errors(recordings, markers)
-    result = []
+    result, frames = [], observed_frames(recordings)
     for b, name in enumerate(names):
         item = dataset.trajectories[name]
-        seen = item.valid.any(axis=1)
         result.append(
             Comparison(
                 dataset.name,
@@ -89,7 +88,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
                 np.where(item.valid[..., None], item.markers, np.nan),
                 {method: markers[: len(item.time), b] for method, markers in simulated.items()},
                 {method: values[b] for method, values in errors.items()},
-                item.time[seen],
+                item.time[frames[b]],
                 dataset.markers.names,
                 dataset.simulator.mesh,
                 {method: q[[0, len(item.time) - 1], b] for method, q in shapes.items()},

@@ -9,6 +9,7 @@ from rafl.common.errors import InputError
 from rafl.common.files import new_folders
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
+from rafl.data.objective import Objective
 from rafl.fitting.distributed import process_count, rank
 from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs
 from rafl.fitting.run_folder import HISTORY_FILE, SETTINGS_FILE, FittedModel, Settings, read_settings, write_settings
@@ -35,6 +36,7 @@ def fit(
     warm_start: int = 20,
     start: str | Path | None = None,
     by_sigma: bool = False,
+    objective: Objective = "",
     integrator: str = "",
     limit_energy: bool = True,
 ) -> FittedModel:
@@ -62,6 +64,8 @@ def fit(
         warm_start: passes of pre-training on residual targets.
         start: run folder to fine-tune, or a `sysid` run whose material the field corrects.
         by_sigma: weight markers by their uncertainty.
+        objective: compare `image`, the pixels that the cameras measured, or `3d`, the positions; empty for pixels
+            where the datasets have them.
         integrator: `implicit-euler` or `generalised-alpha`; that of the datasets if empty.
         limit_energy: whether the energy that a field adds to a motion is limited by what it added in training.
 
@@ -86,6 +90,7 @@ def fit(
         warm_start=warm_start,
         start=str(Path(start).resolve()) if start else "",
         by_sigma=by_sigma,
+        objective=objective,
         integrator=integrator,
         limit_energy=limit_energy,
     )

@@ -100,7 +100,7 @@ class MaterialSearch:
         prior: Prior | None = None,
     ) -> None:
         used = prepare_datasets(datasets, settings)
-        self.training = batches_by_dataset(training_items(used), settings.by_sigma)
+        self.training = batches_by_dataset(training_items(used), settings)
         self.validation = validation_batches(used)
         self.quantities, self.settings, self.history = quantities, settings, history
         # A frame that was found through the assumed material moves with it, which the recordings' loss does not show.
@@ -242,7 +242,8 @@ class MaterialSearch:
             positions, _ = rollout(few.dataset.simulator, start, len(few.markers) - 1, parameters=parameters)
             markers = few.dataset.markers.positions(positions)
         markers = markers.reshape(len(markers), len(sets), batch, *markers.shape[2:])
-        own: Array = loss_curvature(few, (markers[:, 1:] - markers[:, :1]) / DIFFERENCE_STEP).numpy()
+        slope = (markers[:, 1:] - markers[:, :1]) / DIFFERENCE_STEP
+        own: Array = loss_curvature(few, markers[:, 0], slope).numpy()
         return own * float(motion.mean() / motion[chosen].mean()) if motion[chosen].mean() > 0.0 else own
 
     def descend(self, start: Array, evaluations: int, tolerance: float = EXACT) -> Minimum:
@@ -300,7 +301,7 @@ class MaterialSearch:
     @property
     def observed(self) -> float:
         """Number of coordinates that were observed."""
-        return sum(float((recordings.weight[1:] > 0).sum()) for recordings in self.training)
+        return sum(recordings.observed_coordinates for recordings in self.training)
 
     def parameter_table(self, minimum: Minimum) -> str:
         """CSV text with each value, its 95 % interval and its correlations with the others.

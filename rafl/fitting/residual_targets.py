@@ -113,7 +113,7 @@ def training_targets(
         with progress() as bar:
             task = bar.add_task(f"{dataset.name}: residual targets", total=len(recordings.markers) - 1)
             targets = residual_targets(recordings, FORCE_PENALTY, lambda: bar.advance(task), min_gain)
-        observed = recordings.valid[1:].amax(-1).bool()
+        observed = recordings.observed[1:].amax(-1).bool()
         content = {key: torch.from_numpy(getattr(targets, key))[observed] for key in ("q", "v", "force")}
         save_tensors(path, {"format": FORMAT, "method": "residual forces", **content})
     saved = load_tensors(path, "residual targets of this run")
@@ -157,8 +157,9 @@ class _StepFit:
         """Positions after the step, the force, and the objective (B); starts from `force`, that of the last step."""
         x = self._simulate(force, None)
         gap, objective = self._gap_and_objective(x, force)
-        observed = np.repeat(self.recordings.valid[self.number].numpy(), 3, axis=1)
-        jacobian = self._force_jacobian(x) * observed[..., None]
+        jacobian = self._force_jacobian(x)
+        by_marker = self._seen @ jacobian.reshape(*self._seen.shape[:3], -1)
+        jacobian = by_marker.reshape(jacobian.shape)
         transposed = jacobian.swapaxes(1, 2)
         normal = [cho_factor(a @ a.T + self.penalty * np.eye(len(a)), check_finite=False) for a in jacobian]
         free = self.simulator.engine.free_index
@@ -190,6 +191,11 @@ class _StepFit:
         return self.simulator.minimise(begin, inertia, target, self.external + force, state, label)
 
     @cached_property
+    def _seen(self) -> Array:
+        """Projections onto the directions in which each marker was measured, (B, M, 3, 3)."""
+        return self.recordings.seen_directions(self.number).numpy()
+
+    @cached_property
     def _inertia(self) -> tuple[Array, Array]:
         """Inertia (B, N) [kg/s^2] and the inertial target positions (B, N, 3) [m]."""
         q, v, mass = (torch.from_numpy(x) for x in (self.q, self.v, self.mass))
@@ -199,10 +205,10 @@ class _StepFit:
         return problem.inertia.numpy(), problem.target.numpy()
 
     def _gap_and_objective(self, x: Array, force: Array) -> tuple[Array, Array]:
-        """Marker gaps (B, 3 M) [m], zero where not observed, and the objective (B) [m^2]."""
+        """Marker gaps (B, 3 M) [m] in the directions that were measured, and the objective (B) [m^2]."""
         markers = self.recordings.dataset.markers.positions(torch.from_numpy(x))
-        gap = (markers - self.recordings.markers[self.number]) * self.recordings.valid[self.number][..., None]
-        flat = gap.flatten(1).numpy()
+        gap = (markers - self.recordings.markers[self.number]).numpy()
+        flat = (self._seen @ gap[..., None]).reshape(len(gap), -1)
         return flat, (flat**2).sum(1) + self.penalty * (force**2).sum((1, 2))
 
     def _force_jacobian(self, x: Array) -> Array:

@@ -17,6 +17,7 @@ import yaml
 from rafl.common.errors import InputError
 from rafl.common.files import require_file, write_bytes, write_text
 from rafl.common.yaml_files import check_format, describe_validation, read_yaml_content
+from rafl.data.objective import Objective
 from rafl.fem.material import Material
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.energy_limit import LimitedForce
@@ -109,6 +110,8 @@ class Settings:
         start: run folder whose field or material training starts from; empty for new weights and the datasets' own
             material.
         by_sigma: whether to weight markers by their uncertainty.
+        objective: what is compared: `image`, the pixels that the cameras measured; `3d`, positions; empty for pixels
+            where a dataset has them.
         integrator: time integration of the simulator; empty for that of `start` or else of the datasets.
         limit_energy: whether the energy that a field adds is limited, see `rafl.residual.energy_limit`.
     """
@@ -126,6 +129,7 @@ class Settings:
     warm_start: int = 0
     start: str = ""
     by_sigma: bool = False
+    objective: Objective = ""
     integrator: str = ""
     limit_energy: bool = True
 

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.common.errors import InputError, SimulationError
-from rafl.data.dataset import Dataset, Trajectory
+from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors, training_loss
 from rafl.fitting.distributed import ProcessGroup, process_group
 from rafl.fitting.run_folder import (
@@ -45,12 +45,9 @@ def limit_frames(dataset: Dataset, frames: int) -> Dataset:
     """The dataset with only the first `frames` frames of each recording; 0 for all."""
     if frames == 0:
         return dataset
-
-    def limited(item: Trajectory) -> Trajectory:
-        arrays = {key: getattr(item, key)[:frames] for key in ("time", "markers", "valid", "sigma")}
-        return replace(item, **arrays)
-
-    return replace(dataset, trajectories={name: limited(item) for name, item in dataset.trajectories.items()})
+    return replace(
+        dataset, trajectories={name: item.first_frames(frames) for name, item in dataset.trajectories.items()}
+    )
 
 
 def prepare_datasets(datasets: list[Dataset], settings: Settings) -> list[Dataset]:
@@ -88,13 +85,18 @@ def training_items(datasets: list[Dataset]) -> list[Item]:
     return items
 
 
-def batches_by_dataset(items: list[Item], by_sigma: bool = False) -> list[Recordings]:
-    """One batch of recordings for each dataset; a batch is simulated at once."""
+def batches_by_dataset(items: list[Item], settings: Settings | None = None) -> list[Recordings]:
+    """One batch of recordings for each dataset; a batch is simulated at once.
+
+    settings: of the fit that compares them; None if only errors are of interest.
+    """
     names: dict[int, list[str]] = {}
     owners = {id(item.dataset): item.dataset for item in items}
     for item in items:
         names.setdefault(id(item.dataset), []).append(item.name)
-    return [Recordings.of(owners[key], chosen, by_sigma) for key, chosen in names.items()]
+    if settings is None:
+        return [Recordings.of(owners[key], chosen) for key, chosen in names.items()]
+    return [Recordings.of(owners[key], chosen, settings.by_sigma, settings.objective) for key, chosen in names.items()]
 
 
 def validation_batches(datasets: list[Dataset]) -> list[Recordings]:
@@ -300,7 +302,7 @@ class _Training:
         mean, failures = torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
         reason = f"a simulation of {', '.join(item.name for item in batch)} failed in epoch {len(self.history)}"
         try:
-            for recordings in batches_by_dataset(self.group.share(batch), self.settings.by_sigma):
+            for recordings in batches_by_dataset(self.group.share(batch), self.settings):
                 force = self.field.on(recordings.dataset.simulator, torch.float32)
                 simulated, forces = recordings.simulate(force)
                 loss = training_loss(recordings, simulated, forces, self.settings.force_penalty)

@@ -31,7 +31,6 @@ LINE_TOLERANCE = 0.12  # fraction of the neighbour's distance: how far a marker 
 MIN_LINES = 3  # lines that a dot must lie on to count as in the markers' rows
 MIN_ROW_SINE = 0.5  # sine of the angle to the nearest neighbour's direction: above it, a marker lies in another row
 MAX_EXTENSION_ROW_SPACINGS = 1.3  # row spacings: no row continues farther than this from all markers
-MAX_DARKENING = 0.15  # fraction of the neighbours' light: highlights add light, so surroundings are hardly darker
 MIN_CONTRAST_RATIO = 0.3  # of the median contrast; below it, the relative contrast must be that of the markers too
 MIN_SHADED_CONTRAST_RATIO = 0.15  # of the median contrast: no marker has less
 MAX_RELATIVE_CONTRAST = 1.25  # 1 is a black dot
@@ -155,16 +154,16 @@ def _dissimilarity(dots: Dots, markers: Dots) -> Array:
     return np.where(dots.relative_contrast < MAX_RELATIVE_CONTRAST + 2.0 * radius_sigma, np.sqrt(total), np.inf)
 
 
-def count_lines_through(position: Array, markers: Array, max_offset: float = np.inf) -> int:
+def count_lines_through(position: Array, markers: Array) -> int:
     """Count the lines that a position (2) forms with two of the markers (M, 2), at equal distances.
 
     The position is the middle of the line or, next to the two markers, its end. The third point may be beside the line
-    by `LINE_TOLERANCE` of the distance, and by max_offset at most [px].
+    by `LINE_TOLERANCE` of the distance.
     """
     offset = markers - position
     distance = np.linalg.norm(offset, axis=1)
     near = np.argsort(distance)[:LINE_NEIGHBOURS]
-    tolerance = np.minimum(LINE_TOLERANCE * distance[near], max_offset)
+    tolerance = LINE_TOLERANCE * distance[near]
     tree = cKDTree(markers)
     in_line = [tree.query(end)[0] < tolerance for end in (position + 2.0 * offset[near], position - offset[near])]
     return int(in_line[0].sum() + in_line[1].sum() // 2)
@@ -226,19 +225,13 @@ def _add_similar_dots(image: Array, appearance: MarkerAppearance, markers: Dots,
     first, more = refitted[: len(markers)], refitted[len(markers) :]
     good, more = appearance.matches(first), more[appearance.matches(more) & more.within(image)]
     dissimilarity = _dissimilarity(more, markers)
-    nearest = np.arange(min(LINE_NEIGHBOURS, len(markers))) + 1
-    near = cKDTree(markers.centre).query(more.centre, nearest)[1]
-    level = np.median(markers.parameters[near, 9], axis=1)
-    light = np.maximum(level, level + appearance.contrast)
-    may_have_highlight = (dissimilarity < MAX_ROW_DISSIMILARITY) & (
-        level - more.parameters[:, 9] < MAX_DARKENING * light
-    )
+    similar = dissimilarity < MAX_ROW_DISSIMILARITY  # under a highlight
     reach = MAX_EXTENSION_ROW_SPACINGS * row_spacing(markers.centre)
     accepted, before = dissimilarity < MAX_DISSIMILARITY, -1
     while accepted.sum() > before:  # each accepted dot extends rows
         before = int(accepted.sum())
         known = np.concatenate([markers.centre, more.centre[accepted]])
         lines = np.array([count_lines_through(position, known) for position in more.centre], int)
-        accepted |= (lines >= MIN_LINES) & (cKDTree(known).query(more.centre)[0] < reach) & may_have_highlight
+        accepted |= (lines >= MIN_LINES) & (cKDTree(known).query(more.centre)[0] < reach) & similar
     all_dots = first[good].extended_by(markers[~good]).extended_by(more[accepted])
     return remove_duplicates(all_dots, MIN_SEPARATION_RADII * appearance.radius)

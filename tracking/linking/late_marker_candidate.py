@@ -76,14 +76,9 @@ class Candidate:
         """Whether it moves less relative to the body than in the image."""
         return _spread(self.rest) < _spread(self.positions)
 
-    def is_static(self, max_rest_spread: float = np.inf) -> bool:
-        """Whether it stays still in the image, with at most the given spread on the body [px]."""
-        many = len(self.observations) >= LONG_HISTORY
-        return many and _spread(self.positions) < MAX_STATIC_SPREAD and _spread(self.rest) < max_rest_spread
-
     def is_long_static(self) -> bool:
-        """Whether it has been static for so long that further observations will hardly change that."""
-        return len(self.observations) > 2 * LONG_HISTORY and self.is_static()
+        """Whether it stayed still in the image for so long that further observations will hardly change that."""
+        return len(self.observations) > 2 * LONG_HISTORY and _spread(self.positions) < MAX_STATIC_SPREAD
 
     def _follows_body_modes(self) -> bool:
         """Whether the main modes of the body's motion explain its motion.

@@ -1,8 +1,7 @@
 """Detecting markers that appear after the first frame, from behind a hand or from outside the image.
 
 A dot becomes a marker if it moves and keeps its position on the body over several observations, and if nearly all of
-the last frames show it there. Background blobs do neither. Near a clamp markers stay still too. There, a static dot
-becomes a marker if it continues the body's rows and the first frame did not show it.
+the last frames show it there. Background blobs do neither.
 """
 
 from collections import deque
@@ -13,15 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from rafl.tracking.detection.appearance import (
-    LINE_TOLERANCE,
-    MAX_EXTENSION_ROW_SPACINGS,
-    MIN_CONTRAST_RATIO,
-    MIN_LINES,
-    MarkerAppearance,
-    count_lines_through,
-    row_spacing,
-)
+from rafl.tracking.detection.appearance import MIN_CONTRAST_RATIO, MarkerAppearance, row_spacing
 from rafl.tracking.detection.detect import (
     MIN_SEPARATION_RADII,
     Dots,
@@ -51,7 +42,6 @@ EARLIER_GATE_FACTOR, EARLIER_GATE_PX = 2.0, 0.5
 MAX_LOST_FRAMES = 2  # before the first observation: after so many frames in a row without the dot, tracking back ends
 MIN_FOUND_SHARE, MIN_FOUND_FRAMES = 0.8, 3  # of the frames since its first observation, those that must show the dot
 MIN_BODY_MARKERS = 3  # visible, to determine a dot's position on the body
-MAX_STATIC_REST_SPREAD = 0.15  # spread on the body of a dot that is static in the image [spacings]
 MAX_JUMP = 0.5  # of one dot relative to the body, from frame to frame [spacings]
 # Several dots were taken for one if the median step is below both: shares of the path's spread and of the body's step.
 MIN_STEP_TO_SPREAD, MIN_STEP_TO_BODY_STEP = 0.02, 0.1
@@ -98,7 +88,6 @@ class LateMarkerFinder:
     _candidates: list[Candidate] = field(default_factory=list)
     _next_search: int = 0  # frame
     _kept_frames: deque[_KeptFrame] = field(default_factory=deque)
-    _first_image: Array | None = None
 
     def find(
         self,
@@ -123,7 +112,6 @@ class LateMarkerFinder:
         """
         frame = _KeptFrame(number, image, positions, seen & ~static)
         self._kept_frames.append(frame)
-        self._first_image = image if self._first_image is None else self._first_image
         most = MAX_KEPT_FRAMES if self._candidates else IDLE_KEPT_FRAMES  # decoding is slower outside the cache
         while len(self._kept_frames) > max(min(most, MAX_KEPT_BYTES // image.nbytes), 1):
             self._kept_frames.popleft()
@@ -142,12 +130,7 @@ class LateMarkerFinder:
         static_only = all(candidate.is_long_static() for candidate in self._candidates)
         interval = IDLE_INTERVAL if not self._candidates else STATIC_INTERVAL if static_only else CANDIDATE_INTERVAL
         self._next_search = number + interval
-        rest = pattern.rest[~static]
-        ready = [
-            candidate
-            for candidate in self._candidates
-            if candidate.moves_with_body() or self._continues_rows(candidate, rest, parameters, spacing)
-        ]
+        ready = [candidate for candidate in self._candidates if candidate.moves_with_body()]
         self._candidates = [candidate for candidate in self._candidates if candidate not in ready]
         markers: list[LateMarker] = []
         for candidate in ready:
@@ -208,23 +191,6 @@ class LateMarkerFinder:
         self._candidates = [known.get(row, Candidate()) for row in range(len(found))]
         for candidate, own_rest, position in zip(self._candidates, rest, found, strict=True):
             candidate.observations.append(Observation(frame.number, own_rest, position, frame.positions))
-
-    def _continues_rows(self, candidate: Candidate, rest: Array, parameters: Array, spacing: float) -> bool:
-        """Whether a static candidate continues the rows of the body at rest (M, 2), and was not in the first frame."""
-        if (
-            not candidate.is_static(MAX_STATIC_REST_SPREAD * spacing)
-            or candidate.is_long_static()
-            or self._first_image is None
-        ):
-            return False
-        position, tolerance = np.median(candidate.rest, axis=0), LINE_TOLERANCE * spacing
-        if np.linalg.norm(rest - position, axis=1).min() > MAX_EXTENSION_ROW_SPACINGS * row_spacing(rest):
-            return False
-        least = min(count_lines_through(own, np.delete(rest, k, axis=0), tolerance) for k, own in enumerate(rest))
-        if count_lines_through(position, rest, tolerance) < np.clip(least, 1, MIN_LINES):
-            return False
-        at_first = fit_dots(self._first_image, _median_discs(candidate.positions[-1:], parameters))
-        return not self._match(at_first)[0]
 
     def _track_back(
         self, candidate: Candidate, pattern: MarkerPattern, parameters: Array, spacing: float

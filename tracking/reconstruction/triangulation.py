@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
-from rafl.calibration.camera import OrthographicCamera
+from rafl.calibration.camera import Camera, OrthographicCamera
 from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
 
@@ -215,10 +215,15 @@ def _excess(
     for name, item in pixels.items():
         camera = rig.cameras[name]
         gap = np.linalg.norm(camera.project(position) - item.pixel, axis=-1)
-        sigma = np.sqrt((item.sigma**2).sum(-1) + 2.0 * camera.residual**2)
         with np.errstate(invalid="ignore"):
-            result[name] = np.where(seen[name], gap - OUTLIER_SIGMAS * sigma - OUTLIER_PIXELS, -np.inf)
+            result[name] = np.where(seen[name], gap - outlier_limit(item.sigma, camera), -np.inf)
     return result
+
+
+def outlier_limit(sigma: Array, camera: Camera) -> Array:
+    """Reprojection residual above which a pixel of the given sigma (..., 2) is an outlier [px], (...)."""
+    limit: Array = OUTLIER_SIGMAS * np.sqrt((sigma**2).sum(-1) + 2.0 * camera.residual**2) + OUTLIER_PIXELS
+    return limit
 
 
 def _drop_outliers(

@@ -1,0 +1,139 @@
+"""What the cameras measured of one recording: pixels with their covariances, and the cameras themselves."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rafl.calibration.camera import Camera
+from rafl.common.arrays import ArrayFormat
+
+Array = NDArray[Any]
+
+# Cameras whose lines of sight differ by less than this [rad] do not show a marker's position along them.
+MIN_ANGLE = 0.1
+VIEW_ARRAYS = {
+    "pixel": ArrayFormat(("T", "M", 2), finite=False),
+    "covariance": ArrayFormat(("T", "M", 2, 2), finite=False),
+    "lag": ArrayFormat(("T",)),
+}
+
+
+@dataclass(frozen=True)
+class View:
+    """What one camera measured of the markers of one recording.
+
+    Attributes:
+        camera: in the specimen frame.
+        pixel: (T, M, 2), NaN where not seen.
+        covariance: of the pixels [px^2], (T, M, 2, 2), NaN where not seen.
+        lag: time at which this camera measured minus that of the recording's frame [s], (T).
+    """
+
+    camera: Camera
+    pixel: Array
+    covariance: Array
+    lag: Array
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Which markers the camera saw, (T, M)."""
+        seen: NDArray[np.bool_] = np.isfinite(self.pixel[..., 0])
+        return seen
+
+    def select_markers(self, chosen: NDArray[np.int64]) -> "View":
+        """The measurements of the given markers; NaN for the index -1."""
+        gone = chosen < 0
+        pixel, covariance = self.pixel[:, chosen].copy(), self.covariance[:, chosen].copy()
+        pixel[:, gone], covariance[:, gone] = np.nan, np.nan
+        return replace(self, pixel=pixel, covariance=covariance)
+
+    def select_frames(self, chosen: slice) -> "View":
+        """The measurements in some frames."""
+        return replace(self, pixel=self.pixel[chosen], covariance=self.covariance[chosen], lag=self.lag[chosen])
+
+    def check(self, label: str) -> None:
+        """Raise ValueError unless every pixel that was seen has a covariance, and the lags are small."""
+        own = self.covariance[self.seen]
+        symmetric = np.isfinite(own).all() and np.allclose(own, own.swapaxes(1, 2), rtol=1e-6)
+        if not symmetric or (len(own) and np.linalg.eigvalsh(own).min() <= 0.0):
+            raise ValueError(f"{label}/covariance: expected a positive definite matrix for every pixel")
+        if not np.isfinite(self.pixel[self.seen]).all():
+            raise ValueError(f"{label}/pixel: expected two finite numbers where a marker is seen")
+
+
+def seen_axes(views: Mapping[str, View], position: Array) -> tuple[Array, Array]:
+    """Directions in which the cameras measured markers, and the standard deviations along them.
+
+    Args:
+        views: of one frame each, (1, M, 2).
+        position: about which the projection is linearised [m], (M, 3).
+
+    Returns:
+        Orthonormal rows for every marker, (M, 3, 3), and the sigma along each [m], (M, 3), largest last; infinite where
+        no camera measured.
+    """
+    information = np.zeros((len(position), 3, 3))
+    for view in views.values():
+        seen = view.seen[0]
+        slope = view.camera.jacobian(position[seen])
+        information[seen] += slope.swapaxes(1, 2) @ np.linalg.solve(view.covariance[0, seen], slope)
+    values, vectors = np.linalg.eigh(information)
+    values, axes = values[:, ::-1], vectors[:, :, ::-1].swapaxes(1, 2)
+    known = values > MIN_ANGLE**2 * np.maximum(values[:, 1:2], 1e-300)
+    sigma = np.full(values.shape, np.inf)
+    sigma[known] = values[known] ** -0.5
+    return axes, sigma
+
+
+class _Projection(torch.autograd.Function):
+    """Pixels (..., 2) of points (..., 3) [m] by a camera; differentiable."""
+
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, camera: Camera) -> Tensor:
+        own = points.detach().numpy()
+        ctx.save_for_backward(torch.from_numpy(camera.jacobian(own)))
+        return torch.from_numpy(camera.project(own))
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Any) -> Any:
+        (slope,) = ctx.saved_tensors
+        return (gradients[0][..., None, :] @ slope)[..., 0, :], None
+
+
+def project(points: Tensor, cameras: list[Camera]) -> Tensor:
+    """Pixels (T, B, M, 2) of points (T, B, M, 3) [m] of B recordings, each by its own camera; differentiable."""
+    parts = [_Projection.apply(points[:, b], camera) for b, camera in enumerate(cameras)]  # type: ignore[no-untyped-call]
+    return torch.stack(parts, dim=1)
+
+
+def at_lags(markers: Tensor, lag: Tensor) -> Tensor:
+    """Markers (T, B, ..) at times that differ from those of the frames, by cubic polynomials through four frames.
+
+    lag: difference of the times [time steps], (T, B).
+    """
+    count = len(markers)
+    if count < 4 or not bool((lag != 0.0).any()):
+        return markers
+    time = torch.arange(count, dtype=lag.dtype)[:, None] + lag
+    first = (time.floor().long() - 1).clamp(0, count - 4)
+    x = time - first
+    batch = torch.arange(lag.shape[1])
+    result = torch.zeros_like(markers)
+    for k in range(4):
+        weight = torch.ones_like(x)
+        for other in range(4):
+            if other != k:
+                weight = weight * (x - other) / (k - other)
+        result = result + weight.reshape(*weight.shape, *[1] * (markers.ndim - 2)) * markers[first + k, batch]
+    return result
+
+
+def project_slope(points: Tensor, cameras: list[Camera]) -> Tensor:
+    """Derivatives of `project` by the points [px/m], (T, B, M, 2, 3)."""
+    parts = [torch.from_numpy(camera.jacobian(points[:, b].detach().numpy())) for b, camera in enumerate(cameras)]
+    return torch.stack(parts, dim=1)

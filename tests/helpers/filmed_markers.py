@@ -1,0 +1,71 @@
+"""Datasets whose markers were filmed: exact positions become pixels of given cameras."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera
+from rafl.data.dataset import Dataset, Trajectory
+from rafl.data.views import View
+
+SIZE = (1280, 720)
+PIXELS_PER_METRE = 8000.0
+
+
+def side_camera(angle: float, distortion: tuple[float, float] = (0.0, 0.0)) -> OrthographicCamera:
+    """An orthographic camera that looks along y, turned about z by an angle [rad]."""
+    axes = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    rotation = axes @ Rotation.from_rotvec([0.0, 0.0, -angle]).as_matrix()
+    return OrthographicCamera(
+        image_size=SIZE,
+        rotation_vector=tuple(Rotation.from_matrix(rotation).as_rotvec().tolist()),
+        scale=(PIXELS_PER_METRE, PIXELS_PER_METRE),
+        offset=(300.0, 400.0),
+        distortion=distortion,
+    )
+
+
+def pinhole_camera(distance: float) -> PinholeCamera:
+    """A pinhole camera with distortion that looks along y from a distance [m]."""
+    axes = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return PinholeCamera(
+        image_size=SIZE,
+        rotation_vector=tuple(Rotation.from_matrix(axes).as_rotvec().tolist()),
+        focal=(PIXELS_PER_METRE * distance, PIXELS_PER_METRE * distance),
+        centre=(640.0, 360.0),
+        translation=(-0.03, 0.01, distance),
+        distortion=(0.05, -0.02, 1e-3, -2e-3, 0.01),
+    )
+
+
+def filmed(
+    dataset: Dataset,
+    cameras: Mapping[str, Camera],
+    sigma: float = 0.02,
+    noise: np.random.Generator | None = None,
+) -> Dataset:
+    """The dataset with what the cameras see of all valid markers.
+
+    Args:
+        dataset: with positions.
+        cameras: in the specimen frame.
+        sigma: of the pixels [px].
+        noise: adds errors of this sigma to the pixels; none if None.
+    """
+
+    def view(camera: Camera, item: Trajectory) -> View:
+        pixel = camera.project(item.markers)
+        if noise is not None:
+            pixel = pixel + noise.normal(0.0, sigma, pixel.shape)
+        covariance = np.where(item.valid[..., None, None], sigma**2 * np.eye(2), np.nan)
+        return View(camera, np.where(item.valid[..., None], pixel, np.nan), covariance, np.zeros(len(item.time)))
+
+    return replace(
+        dataset,
+        trajectories={
+            name: replace(item, views={key: view(camera, item) for key, camera in cameras.items()})
+            for name, item in dataset.trajectories.items()
+        },
+    )

@@ -1,0 +1,211 @@
+"""The objective in the image plane, and the views in the dataset file."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+import torch
+from filmed_markers import PIXELS_PER_METRE, filmed, pinhole_camera, side_camera
+
+from rafl.common.errors import InputError
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import damaged_parts, read_dataset, write_dataset
+from rafl.data.objective import Recordings, frame_errors, loss_curvature, recording_losses, training_loss
+from rafl.data.views import View, at_lags, seen_axes
+
+CAMERAS = {"left": side_camera(0.0), "right": side_camera(np.pi / 2)}
+
+
+def random_offsets(recordings: Recordings, size: float, seed: int = 0) -> torch.Tensor:
+    """Offsets of markers [m], (T, B, M, 3)."""
+    random = np.random.default_rng(seed)
+    return torch.from_numpy(random.normal(0.0, size, tuple(recordings.markers.shape)))
+
+
+def test_motion_along_the_line_of_sight_of_one_camera_costs_nothing(dataset: Dataset) -> None:
+    """The other two directions cost as much as they do in space."""
+    recordings = Recordings.of(filmed(dataset, {"left": side_camera(0.0)}), ["a", "b"])
+    assert recordings.in_image
+    along = torch.tensor([0.0, 0.004, 0.0], dtype=torch.float64)
+    across = torch.tensor([0.0001, 0.0, 0.0002], dtype=torch.float64)
+    nothing = torch.empty(0)
+    assert float(training_loss(recordings, recordings.markers + along, nothing)) == pytest.approx(0.0, abs=1e-18)
+    in_space = Recordings.of(dataset, ["a", "b"])
+    expected = float(training_loss(in_space, in_space.markers + across, nothing))
+    found = float(training_loss(recordings, recordings.markers + along + across, nothing))
+    assert found == pytest.approx(expected, rel=1e-9)
+    np.testing.assert_allclose(
+        np.concatenate(frame_errors(recordings, recordings.markers + along + across)), np.sqrt(5e-8)
+    )
+
+
+def test_two_cameras_at_right_angles_count_the_shared_direction_twice(dataset: Dataset) -> None:
+    recordings = Recordings.of(filmed(dataset, CAMERAS), ["a"])
+    steps = len(recordings.markers) - 1
+    markers = recordings.markers.shape[2]
+    for direction, count in (([1.0, 0.0, 0.0], 1), ([0.0, 1.0, 0.0], 1), ([0.0, 0.0, 1.0], 2)):
+        offset = 0.001 * torch.tensor(direction, dtype=torch.float64)
+        loss = float(recording_losses(recordings, recordings.markers + offset))
+        assert loss == pytest.approx(1e3 * count * markers * 1e-6 * steps / steps, rel=1e-9)
+        np.testing.assert_allclose(frame_errors(recordings, recordings.markers + offset)[0], 0.001)
+
+
+def test_pixels_count_by_their_covariance(dataset: Dataset) -> None:
+    """A sigma four times as large counts for a sixteenth. One ten times smaller than the median counts as a fifth."""
+    with_views = filmed(dataset, {"left": side_camera(0.0)})
+    item = with_views.trajectories["a"]
+    covariance = item.views["left"].covariance.copy()
+    covariance[:, 0] *= 16.0
+    covariance[:, 1] *= 0.01
+    views = {"left": replace(item.views["left"], covariance=covariance)}
+    changed = replace(with_views, trajectories={**with_views.trajectories, "a": replace(item, views=views)})
+    recordings = Recordings.of(changed, ["a"])
+    for marker, weight in ((0, 1 / 16), (1, 25.0), (2, 1.0)):
+        offset = torch.zeros_like(recordings.markers)
+        offset[:, :, marker, 0] = 0.00005
+        loss = float(recording_losses(recordings, recordings.markers + offset))
+        assert loss == pytest.approx(1e3 * weight * 0.00005**2, rel=1e-6)
+
+
+@pytest.mark.parametrize("size", [2e-4, 2e-2])
+def test_gradient_through_distorted_cameras_and_lags(dataset: Dataset, size: float) -> None:
+    """Also where residuals are large and count linearly."""
+    cameras = {"left": side_camera(0.2, (0.03, -0.01)), "top": pinhole_camera(0.5)}
+    with_views = filmed(dataset, cameras)
+    lagging = {}
+    for number, (name, item) in enumerate(with_views.trajectories.items()):
+        views = {key: replace(view, lag=view.lag + 0.003 * (1 + number)) for key, view in item.views.items()}
+        lagging[name] = replace(item, views=views)
+    recordings = Recordings.of(replace(with_views, trajectories=lagging), ["a", "b"])
+    simulated = (recordings.markers + random_offsets(recordings, size)).requires_grad_()
+    (gradient,) = torch.autograd.grad(recording_losses(recordings, simulated).sum(), simulated)
+    direction, step = random_offsets(recordings, 1.0, 1), 1e-7
+    with torch.no_grad():
+        ahead, behind = (recording_losses(recordings, simulated + s * direction).sum() for s in (step, -step))
+    assert float((gradient * direction).sum()) == pytest.approx(float(ahead - behind) / (2 * step), rel=1e-5)
+
+
+def test_curvature_is_that_of_the_loss_at_small_residuals(dataset: Dataset) -> None:
+    recordings = Recordings.of(filmed(dataset, CAMERAS | {"top": pinhole_camera(0.5)}), ["a", "b"])
+    slope = torch.stack([random_offsets(recordings, 1.0, seed) for seed in (1, 2)], dim=1)
+    found = loss_curvature(recordings, recordings.markers, slope)
+    step, none = 1e-6, torch.empty(0)
+
+    def loss(a: float, b: float) -> float:
+        return float(training_loss(recordings, recordings.markers + step * (a * slope[:, 0] + b * slope[:, 1]), none))
+
+    expected = np.array([[2 * loss(1, 0), 0], [0, 2 * loss(0, 1)]]) / step**2
+    expected[0, 1] = expected[1, 0] = (loss(1, 1) - loss(1, 0) - loss(0, 1)) / step**2
+    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-4)
+
+
+def test_one_marker_far_off_counts_linearly(dataset: Dataset) -> None:
+    recordings = Recordings.of(filmed(dataset, {"left": side_camera(0.0)}), ["a"])
+    limit = float(recordings.limit.sqrt())
+    losses = []
+    for distance in (0.5 * limit, 4.0 * limit, 8.0 * limit):
+        offset = torch.zeros_like(recordings.markers)
+        offset[:, :, 0, 0] = distance
+        losses.append(float(recording_losses(recordings, recordings.markers + offset)))
+    assert losses[0] == pytest.approx(1e3 * 0.25 * limit**2)
+    assert losses[1:] == pytest.approx([1e3 * 7.0 * limit**2, 1e3 * 15.0 * limit**2])
+
+
+def test_lags_are_exact_for_cubic_paths() -> None:
+    random = np.random.default_rng(0)
+    time = torch.arange(9, dtype=torch.float64)
+    factors = torch.from_numpy(random.normal(size=(4, 2, 5, 3)))
+
+    def path(t: torch.Tensor) -> torch.Tensor:
+        powers = torch.stack([t**k for k in range(4)])
+        return torch.einsum("ktb,kbmi->tbmi", powers, factors)
+
+    lag = torch.from_numpy(random.uniform(-1.0, 1.0, (9, 2)))
+    own = path(time[:, None].repeat(1, 2))
+    np.testing.assert_allclose(at_lags(own, lag).numpy(), path(time[:, None] + lag).numpy(), rtol=1e-9)
+    assert at_lags(own, torch.zeros(9, 2)) is own
+
+
+def test_seen_axes_of_one_and_two_cameras() -> None:
+    def view(angle: float, sigma: float, seen: list[bool]) -> View:
+        pixel = np.where(np.array(seen)[None, :, None], 100.0, np.nan)
+        covariance = np.where(np.array(seen)[None, :, None, None], sigma**2 * np.eye(2), np.nan)
+        return View(side_camera(angle), pixel, covariance, np.zeros(1))
+
+    views = {"a": view(0.0, 0.02, [True, True, False]), "b": view(np.pi / 2, 0.04, [True, False, False])}
+    axes, sigma = seen_axes(views, np.zeros((3, 3)))
+    np.testing.assert_allclose(axes @ axes.swapaxes(1, 2), np.broadcast_to(np.eye(3), (3, 3, 3)), atol=1e-12)
+    metres = 0.02 / PIXELS_PER_METRE
+    np.testing.assert_allclose(sigma[0], [metres * np.sqrt(0.8), metres, 2.0 * metres])  # z twice, x, y
+    np.testing.assert_allclose(sigma[1], [metres, metres, np.inf])
+    np.testing.assert_allclose(np.abs(axes[1, 2]), [0.0, 1.0, 0.0], atol=1e-12)
+    assert np.isinf(sigma[2]).all()
+
+
+def test_views_are_stored_with_their_cameras(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "filmed.h5"
+    noisy = filmed(dataset, CAMERAS | {"top": pinhole_camera(0.5)}, noise=np.random.default_rng(0))
+    write_dataset(path, noisy)
+    found = read_dataset(path)
+    for name, item in noisy.trajectories.items():
+        for key, view in item.views.items():
+            own = found.trajectories[name].views[key]
+            np.testing.assert_array_equal(own.pixel, view.pixel)
+            np.testing.assert_array_equal(own.covariance, view.covariance)
+            points = item.markers[0]
+            np.testing.assert_allclose(own.camera.project(points), view.camera.project(points), atol=1e-9)
+    assert damaged_parts(path) == []
+    with h5py.File(path, "r+") as file:
+        file["trajectories/a/views/left/pixel"][3, 2] += 1.0
+    assert damaged_parts(path) == ["trajectories/a"]
+
+
+def test_files_of_the_first_format_are_read(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "old.h5"
+    write_dataset(path, dataset)
+    with h5py.File(path, "r+") as file:
+        assert "views" not in file["trajectories/a"]
+        file.attrs["format"] = "rafl-dataset/1"
+    found = read_dataset(path)
+    assert found.trajectories["a"].views == {}
+    assert not Recordings.of(found, ["a"]).in_image
+
+
+@pytest.mark.parametrize("damage", ["calibration", "camera", "pixel", "covariance", "lag"])
+def test_damaged_views_are_refused(dataset: Dataset, tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "filmed.h5"
+    write_dataset(path, filmed(dataset, CAMERAS))
+    with h5py.File(path, "r+") as file:
+        views = file["trajectories/a/views"]
+        if damage == "calibration":
+            views.attrs["calibration"] = "format: rafl-calibration/1\ncameras: {left: {model: fisheye}}"
+        elif damage == "camera":
+            views.move("left", "other")
+        elif damage == "pixel":
+            views["left/pixel"][2, 1] = [np.nan, 5.0]
+            views["left/pixel"][2, 2] = [5.0, np.nan]
+        elif damage == "covariance":
+            views["left/covariance"][2, 1] = [[1.0, 2.0], [2.0, 1.0]]
+        else:
+            views["left/lag"][2] = 0.5
+    with pytest.raises(InputError, match=r"filmed\.h5"):
+        read_dataset(path)
+
+
+def test_pixels_that_are_not_there_cannot_be_compared(dataset: Dataset) -> None:
+    with pytest.raises(InputError, match="recording a: expected the pixels"):
+        Recordings.of(dataset, ["a"], objective="image")
+    with_views = filmed(dataset, CAMERAS)
+    assert not Recordings.of(with_views, ["a"], objective="3d").in_image
+
+
+def test_parts_of_recordings_keep_their_pixels(dataset: Dataset) -> None:
+    recordings = Recordings.of(filmed(dataset, CAMERAS, noise=np.random.default_rng(0)), ["a", "b", "c"])
+    part = recordings.select([2, 0]).first_frames(7).select_markers(np.array([3, 5]))
+    simulated = recordings.markers[:7, [2, 0]][:, :, [3, 5]] + 1e-3
+    whole = [gap[:7][:, [2, 0]][:, :, [3, 5]] for gap in recordings.gaps(recordings.markers + 1e-3)]
+    for own, expected in zip(part.gaps(simulated), whole, strict=True):
+        np.testing.assert_allclose(own.numpy(), expected.numpy(), atol=1e-15)
+    np.testing.assert_allclose(part.limit.numpy(), recordings.limit[[2, 0]].numpy())
