@@ -24,9 +24,6 @@ FROM_REPORTS = {
     "tracks-residuals": ("tracks/report.html", 2),
     "dataset-mesh": ("canonical.html", 0),
     "dataset-first-frames": ("canonical.html", 1),
-    "error-over-time": ("run/report.html", 0),
-    "marker-trajectory": ("run/report.html", 1),
-    "bodies": ("run/report.html", -1),
 }
 
 

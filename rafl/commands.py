@@ -22,6 +22,7 @@ from rafl.common.names import require_names
 from rafl.common.text_tables import spreadsheet_text
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
+from rafl.evaluation.evaluation_file import EVALUATION_FILE, Evaluation, write_evaluation
 from rafl.evaluation.metrics import (
     Comparison,
     Transfer,
@@ -33,7 +34,8 @@ from rafl.evaluation.metrics import (
     motion_table,
     split_table,
 )
-from rafl.evaluation.report import report_page
+from rafl.evaluation.page_data import PageData
+from rafl.evaluation.page_file import page_file
 from rafl.fitting.auto import SELECTION_FILE, selection_sentences
 from rafl.fitting.distributed import rank
 from rafl.fitting.fit import fit as fit_model
@@ -173,7 +175,7 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
     Args:
         runs: run folders of the models.
         files: dataset files.
-        folder: where errors.csv, motions.csv, errors.tex and report.html are written.
+        folder: where errors.csv, motions.csv, errors.tex, evaluation.h5 and report.html are written.
 
     Raises:
         InputError: a run or a dataset cannot be read, or a model is applicable to none of the datasets.
@@ -189,19 +191,19 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
     except SimulationError as error:
         raise _failed_simulation(error) from None
     recordings, splits, motions = error_table(comparisons), split_table(comparisons), motion_table(comparisons)
-    description = "; ".join(f"{name}: {_describe(model)}" for name, model in models.items())
+    evaluation = Evaluation(comparisons, "; ".join(f"{name}: {_describe(model)}" for name, model in models.items()))
     texts = {
         "errors.csv": _spreadsheet(recordings),
         "motions.csv": _spreadsheet(motions),
         "errors.tex": latex_table(splits),
-        "report.html": report_page(comparisons, splits, recordings, motions, description),
+        "report.html": page_file(PageData.of_evaluation(evaluation, f"Evaluation {folder.resolve().name}")),
     }
     transfer = Transfer.of(splits)
     if transfer.errors.shape[1] > 1:
         errors = transfer.errors.rename(index=spreadsheet_text, columns=spreadsheet_text)
         texts["transfer.csv"] = errors.to_csv(float_format="%.6f")
     with written_files({folder / name: text for name, text in texts.items()}):
-        pass
+        write_evaluation(folder / EVALUATION_FILE, evaluation)
     Console(width=100).print(_error_table(splits))
     for sentence in beyond_training(comparisons, models):
         typer.echo(f"warning: {sentence}", err=True)
@@ -209,14 +211,14 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
         simulated = transfer.datasets_simulated[name]
         failing = f"; its simulation fails on {failed[name]} more" if name in failed else ""
         typer.echo(f"{name}: worse than the baseline simulator on {count} of {simulated} datasets{failing}")
-    typer.echo(f"wrote {folder}/errors.csv, motions.csv, errors.tex")
+    typer.echo(f"wrote {folder}/errors.csv, motions.csv, errors.tex, {EVALUATION_FILE}")
     held_out = held_out_errors(comparisons)
     if held_out:
         values = ", ".join(f"{name} {1e3 * error:.3f} mm" for name, error in held_out.items())
         typer.echo(f"held-out marker error: {values}")
     else:
         typer.echo("no recording has split `test`, so this error is not of held-out recordings", err=True)
-    typer.echo(f"report: {folder / 'report.html'} (open it in a browser)")
+    typer.echo(f"report: {folder / 'report.html'} (open it in a browser; rafl-review {folder} shows all frames)")
 
 
 def _spreadsheet(table: pd.DataFrame) -> str:

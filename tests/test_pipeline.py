@@ -1,12 +1,16 @@
 """The complete pipeline by its commands: render, calibrate, track, capture, fit, evaluate."""
 
+import json
 import re
 from pathlib import Path
 
 import h5py
 import numpy as np
 import pandas as pd
+import pytest
 from support import Run
+
+from rafl.evaluation.evaluation_file import read_evaluation
 
 
 def test_rendered_videos_to_fitted_model(specimen_file: Path, run: Run, tmp_path: Path) -> None:
@@ -60,5 +64,12 @@ def test_rendered_videos_to_fitted_model(specimen_file: Path, run: Run, tmp_path
     assert set(errors["method"]) == {"original", "rafl", "sysid"}
     assert len(errors) == 9
     page = (tmp_path / "result/report.html").read_text()
-    assert page.count("<img") == 6  # errors, markers, specimens and residual forces
-    assert "http" not in re.sub(r"base64,[A-Za-z0-9+/=]*", "", page)  # base64 text may contain it by chance
+    (summary,) = re.findall(r'<script type="application/json" id="summary">([^<]*)</script>', page)
+    assert json.loads(summary)["methods"] == ["original", "rafl", "sysid"]
+    assert len(re.findall(r'<script type="text/plain" id="motion-\d">', page)) == 3
+    compared = read_evaluation(tmp_path / "result/evaluation.h5").comparisons
+    found = {(item.recording, name): 1e3 * own.mean() for item in compared for name, own in item.errors.items()}
+    expected = errors.set_index(["recording", "method"])["mean_mm"].to_dict()
+    assert found == pytest.approx(expected, abs=1e-6)
+    forces = [{name: own.force is not None for name, own in item.motions.items()} for item in compared]
+    assert forces == [{"original": False, "rafl": True, "sysid": False}] * 3

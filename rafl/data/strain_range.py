@@ -6,7 +6,7 @@ import numpy as np
 from torch import Tensor
 
 from rafl.fem.mesh import HexMesh
-from rafl.fem.strain import MULTIPLICITY, green_strain
+from rafl.fem.strain import green_strain, magnitude
 
 MARGIN = 0.1  # by which a range must be left before it counts; recordings of one shape scatter by as much
 QUANTILE = 0.99  # over cells and frames: single cells beside the clamp do not count
@@ -32,7 +32,7 @@ class StrainRange:
         strain, _ = green_strain(mesh, mesh.mean_quadrature, flat, np.zeros_like(flat))
         strain = strain[:, :, 0].reshape(frames, batch, -1, 6)
         rate = np.diff(strain, axis=0) / time_step
-        size, speed = (np.sqrt((x**2 * MULTIPLICITY).sum(-1)) for x in (strain, rate))
+        size, speed = magnitude(strain), magnitude(rate)
         return cls(float(np.quantile(size, QUANTILE)), float(np.quantile(speed, QUANTILE)))
 
     def exceeds(self, other: "StrainRange") -> bool:

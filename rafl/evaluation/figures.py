@@ -60,17 +60,3 @@ def draw_specimens(mesh: HexMesh, frames: list[tuple[str, Array, Array]]) -> str
         known = 1e3 * markers[np.isfinite(markers[:, 0])]
         axes.scatter(*known.T, color="#c0392b", s=6, depthshade=False, zorder=surface.zorder + 1)
     return encode_png(figure)
-
-
-def draw_residual_forces(mesh: HexMesh, magnitude: dict[str, Array]) -> str:
-    """Draw the mean magnitude (N) [N] of the residual force at every vertex, by method, as colour on the rest shape.
-
-    Returns:
-        The figure (as in the paper) as a PNG in base64 text.
-    """
-    figure = plt.figure(figsize=(5.2 * len(magnitude), 4.2), layout="constrained")
-    for k, (method, values) in enumerate(magnitude.items()):
-        axes = _add_axes_3d(figure, k + 1, len(magnitude), mesh.vertices, method)
-        dots = axes.scatter(*(1e3 * mesh.vertices.T), c=1e3 * values, cmap="viridis", s=22, depthshade=False)
-        figure.colorbar(dots, ax=axes, shrink=0.6, label="mean residual force [mN]")
-    return encode_png(figure)

@@ -13,7 +13,7 @@ from rafl.data.dataset import SPLITS, Dataset
 from rafl.data.objective import Recordings, frame_errors, observed_frames
 from rafl.data.strain_range import StrainRange
 from rafl.evaluation.oscillation import fit_oscillation, most_active_coordinate, rest_position_error
-from rafl.fem.mesh import HexMesh
+from rafl.evaluation.surface import Surface, SurfaceMotion
 from rafl.fitting.run_folder import FittedModel
 
 BASELINE = "original"  # name of the baseline simulator in tables and files
@@ -31,9 +31,8 @@ class Comparison:
         errors: by method, mean distance of the seen markers [m] in each frame that has any, (T').
         error_time: the times of those frames [s], (T').
         marker_names: (M).
-        mesh: of the specimen.
-        shapes: by method, vertices in the first and last frame [m], (2, N, 3).
-        mean_force: by method that has a residual force, its mean magnitude at every vertex [N], (N).
+        surface: boundary of the specimen's mesh.
+        motions: by method, the motion of that boundary; empty where it was not kept.
         strains: by method, strain and strain rate [1/s] that the body reaches, see `rafl.data.strain_range`.
     """
 
@@ -46,9 +45,8 @@ class Comparison:
     errors: dict[str, NDArray[np.float64]]
     error_time: NDArray[np.float64]
     marker_names: tuple[str, ...]
-    mesh: HexMesh
-    shapes: dict[str, NDArray[np.float64]]
-    mean_force: dict[str, NDArray[np.float64]]
+    surface: Surface
+    motions: dict[str, SurfaceMotion]
     strains: dict[str, StrainRange]
 
 
@@ -61,7 +59,8 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
     """
     names = list(dataset.trajectories)
     recordings = Recordings.of(dataset, names)
-    simulated, errors, shapes, magnitudes, strains = {}, {}, {}, {}, {}
+    mesh, lengths = dataset.simulator.mesh, [len(dataset.trajectories[name].time) for name in names]
+    simulated, errors, motions, strains = {}, {}, {}, {}
     with torch.no_grad():
         for method, model in {BASELINE: FittedModel(BASELINE), **models}.items():
             simulator = model.simulator(dataset.simulator)
@@ -69,14 +68,16 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
             q, force = simulate(model.residual(simulator), model.parameters(simulator))
             markers = dataset.markers.positions(q)
             simulated[method] = markers.numpy()
-            shapes[method] = q.numpy()
+            forces = force.numpy() if force.numel() else None
+            motions[method] = [
+                SurfaceMotion.of(mesh, q[:frames, b].numpy(), None if forces is None else forces[: frames - 1, b])
+                for b, frames in enumerate(lengths)
+            ]
             strains[method] = [
                 StrainRange.of(simulator.mesh, q[:, b : b + 1], simulator.time_step) for b in range(len(names))
             ]
-            if force.numel():
-                magnitudes[method] = torch.linalg.norm(force, dim=-1).numpy()
             errors[method] = frame_errors(recordings, markers)
-    result, frames = [], observed_frames(recordings)
+    result, frames, surface = [], observed_frames(recordings), Surface.of(mesh)
     for b, name in enumerate(names):
         item = dataset.trajectories[name]
         result.append(
@@ -90,9 +91,8 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
                 {method: values[b] for method, values in errors.items()},
                 item.time[frames[b]],
                 dataset.markers.names,
-                dataset.simulator.mesh,
-                {method: q[[0, len(item.time) - 1], b] for method, q in shapes.items()},
-                {method: values[: len(item.time) - 1, b].mean(0) for method, values in magnitudes.items()},
+                surface,
+                {method: values[b] for method, values in motions.items()},
                 {method: values[b] for method, values in strains.items()},
             )
         )

@@ -71,7 +71,7 @@ def fit_oscillation(time: Array, x: Array) -> Oscillation:
 
 def most_active_coordinate(markers: Array) -> tuple[int, int]:
     """The marker and the axis with the largest range of motion, of markers (T, M, 3)."""
-    motion_range = np.nanmax(markers, axis=0) - np.nanmin(markers, axis=0)
+    motion_range = np.fmax.reduce(markers, axis=0) - np.fmin.reduce(markers, axis=0)  # NaN of a marker never seen
     marker, axis = np.unravel_index(np.nanargmax(motion_range), motion_range.shape)
     return int(marker), int(axis)
 

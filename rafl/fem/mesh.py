@@ -212,9 +212,23 @@ class HexMesh:
     @cached_property
     def surface(self) -> NDArray[np.int64]:
         """Boundary quads (S, 4), with vertices anticlockwise as seen from outside."""
-        quads = np.concatenate([self.hexes[:, side] for side in CELL_SIDES.values()])
-        _, first, counts = np.unique(np.sort(quads, axis=1), axis=0, return_index=True, return_counts=True)
-        return np.asarray(quads[np.sort(first[counts == 1])])
+        return np.asarray(self._sides[self._boundary])
+
+    @cached_property
+    def surface_cells(self) -> NDArray[np.int64]:
+        """Cell of each boundary quad, (S)."""
+        return np.asarray(self._boundary % len(self.hexes))
+
+    @cached_property
+    def _sides(self) -> NDArray[np.int64]:
+        """Quads of all cells, (6 E, 4): first one side of every cell, then the next."""
+        return np.concatenate([self.hexes[:, side] for side in CELL_SIDES.values()])
+
+    @cached_property
+    def _boundary(self) -> NDArray[np.int64]:
+        """Rows of `_sides` that no other cell shares, (S)."""
+        _, first, counts = np.unique(np.sort(self._sides, axis=1), axis=0, return_index=True, return_counts=True)
+        return np.sort(first[counts == 1])
 
     def face_nodes(self, face: str) -> NDArray[np.int64]:
         """Vertex indices on the bounding-box face `x-min` ... `z-max`.

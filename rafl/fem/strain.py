@@ -23,6 +23,11 @@ def green_strain(mesh: HexMesh, points: QuadraturePoints, q: Array, direction: A
     return strain[..., FIRST, SECOND], strain_change[..., FIRST, SECOND]
 
 
+def magnitude(strain: Array) -> Array:
+    """Frobenius norm (...) of symmetric tensors (..., 6), the root of the sum of their nine squared components."""
+    return np.asarray(np.sqrt((strain**2 * MULTIPLICITY).sum(-1)))
+
+
 def green_strain_adjoint(mesh: HexMesh, points: QuadraturePoints, q: Array, by_strain: Array) -> Array:
     """Derivative by q (B, N, 3) of the sum of by_strain (B, E, P, 6) times the Green strain, (B, N, 3)."""
     F = np.einsum("beni,epnj->bepij", q[:, mesh.hexes], points.gradient)

@@ -25,7 +25,7 @@ class View(Protocol):
     """What `rafl-review` shows of one path.
 
     Attributes:
-        page: HTML file in `static/`.
+        page: HTML file in `static/`, here or in `rafl.evaluation`.
         title: what is shown, for the command's first line.
     """
 
@@ -101,7 +101,7 @@ def _static_files(folder: Traversable, prefix: str = "") -> dict[str, bytes]:
 
 def _add_static_files(app: FastAPI, page: str) -> None:
     """Serve the files of the page, which are read once."""
-    contents = _static_files(files("rafl.review") / "static")
+    contents = _static_files(files("rafl.evaluation") / "static") | _static_files(files("rafl.review") / "static")
 
     def answer(name: str) -> Response:
         suffix = name[name.rfind(".") :]

@@ -34,7 +34,8 @@ def prepare(folder: Path) -> Path:
     before = Path.cwd()
     os.chdir(laboratory)
     try:
-        for line in (TARGETS["specimen"][1], ("rafl-fit", "data.h5", *TARGETS["settings"][1][2:-2], "run")):
+        fit = ("rafl-fit", "data.h5", *TARGETS["settings"][1][2:-2], "run")
+        for line in (TARGETS["specimen"][1], fit, ("rafl-eval", "run", "data.h5")):
             code, stderr, error = run_line(line)
             if code:
                 raise RuntimeError(f"{line}: exit code {code}: {stderr}") from error

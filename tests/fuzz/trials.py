@@ -30,6 +30,9 @@ from rafl.capture.specimen.specimen import read_specimen
 from rafl.cli import eval_app, fit_app
 from rafl.common.command_line import report_errors
 from rafl.data.dataset_file import read_dataset
+from rafl.evaluation.evaluation_file import EVALUATION_FILE, read_evaluation
+from rafl.evaluation.page_data import PageData
+from rafl.evaluation.page_file import page_file
 from rafl.fitting.run_folder import load_model
 from rafl.tracking.cli import track_app
 from rafl.tracking.reconstruction.tracks import read_tracks
@@ -43,11 +46,17 @@ def read_foreign(path: Path) -> Rig:
     return read_any_calibration(path, unit, lambda count: dict.fromkeys(list(stereo.MATRICES)[:count], stereo.SIZE))
 
 
+def page_of_evaluation(path: Path) -> str:
+    """The page that shows an evaluation."""
+    return page_file(PageData.of_evaluation(read_evaluation(path), "x"))
+
+
 READERS: dict[str, Callable[[Path], object]] = {
     "read_specimen": read_specimen,
     "read_board": read_board,
     "read_marker_names": read_marker_names,
     "load_model": load_model,
+    "page_of_evaluation": page_of_evaluation,
     "read_grey_image": read_grey_image,
     "read_foreign": read_foreign,
 }
@@ -75,6 +84,7 @@ TARGETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "model": ("run/model.pt", ("load_model", "run")),
     "field": ("field/model.pt", ("load_model", "field")),
     "model, evaluate": ("run/model.pt", ("rafl-eval", "run", "data.h5", "--out", "out")),
+    "evaluation": ("run/evaluation.h5", ("page_of_evaluation", "run/evaluation.h5")),
     "settings": ("run/config.yaml", ("rafl-fit", "data.h5", *FIT, "run", "--resume")),
     "checkpoint": ("run/checkpoint.pt", ("rafl-fit", "data.h5", *FIT, "run", "--resume")),
     "calibration": ("calib.yaml", ("rafl-track", "videos", "--calib", "calib.yaml", "--specimen", "dots.yaml")),
@@ -236,5 +246,6 @@ def _wrong_files(before: Content, after: Content, code: int, line: tuple[str, ..
         return f"a run folder that the next start refuses: {changed}"
     for path in changed:
         if (work.parents[1] / path).exists() and path.endswith(".h5"):
-            (read_tracks if "/tracks/" in path else read_dataset)(work.parents[1] / path)
+            read = read_evaluation if path.endswith(EVALUATION_FILE) else read_dataset
+            (read_tracks if "/tracks/" in path else read)(work.parents[1] / path)
     return ""
