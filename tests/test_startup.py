@@ -45,6 +45,7 @@ REFUSED = [
     ["rafl-eval", "run"],
     ["rafl-eval", "run", "absent.h5"],
     ["rafl-review", "absent"],
+    ["rafl-review", "absent.h5"],
     ["rafl-review", ".", "--videos", "absent"],
 ]
 COMMANDS = sorted({line[0] for line in REFUSED})

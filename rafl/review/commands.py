@@ -20,7 +20,28 @@ from rafl.review.tracks.recordings import Library
 from rafl.tracking.single_marker import load_kernels
 
 HOST = "127.0.0.1"
+RUN_FILES = ("model.pt", "evaluation.h5")  # by which a run folder is told from a folder of tracks
 SHUTDOWN_S = 2  # for requests that are being answered when the command is stopped
+
+
+def open_view(path: Path, videos: Path | None, who: str) -> View:
+    """The view of a path.
+
+    Args:
+        path: dataset, run folder or folder of tracks.
+        videos: folder of videos of tracks; None where `rafl-track` found them.
+        who: name for corrections of tracks.
+
+    Raises:
+        InputError: there is nothing of the kind, or it cannot be read.
+    """
+    if path.is_dir() and not any((path / name).exists() for name in RUN_FILES):
+        return open_tracks(path, videos, who)
+    if videos is not None:
+        raise InputError(f"--videos: expected a folder of tracks beside it, found {path}; leave the option out")
+    from rafl.review.results.calls import ResultsView  # takes seconds, which tracks need not wait for
+
+    return ResultsView.of_run(path) if path.is_dir() else ResultsView.of_dataset(path)
 
 
 def open_tracks(tracks: Path, videos: Path | None, who: str) -> TracksView:
@@ -36,7 +57,10 @@ def open_tracks(tracks: Path, videos: Path | None, who: str) -> TracksView:
     """
     library = Library(tracks, videos, who)
     if not library.names():
-        raise InputError(f"expected tracks (.h5) in {tracks}, found none; track the videos with rafl-track")
+        raise InputError(
+            f"expected tracks (.h5) or an evaluated model in {tracks}, found none; track the videos with rafl-track, "
+            "or name a run folder that rafl-eval has evaluated"
+        )
     announce_compilation()
     threading.Thread(target=load_kernels, daemon=True).start()
     return TracksView(library)
@@ -75,4 +99,4 @@ def serve(view: View, port: int, browser: bool) -> None:
         except KeyboardInterrupt as error:
             if isinstance(error, Terminated):
                 raise
-            typer.echo("stopped; all corrections are written")
+            typer.echo("stopped; nothing is left to save")

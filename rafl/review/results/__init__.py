@@ -1,0 +1,1 @@
+"""Recorded markers and simulated bodies: what the page of results asks for."""
