@@ -58,6 +58,7 @@ docs: install build/types
 gallery: demo
 	$(BIN)/python docs/gallery.py $(DEMO)
 	$(BIN)/python docs/gallery_review.py $(DEMO)
+	$(BIN)/python docs/gallery_results.py $(DEMO)
 
 # The package for other people's environments, in dist/.
 wheel: install
