@@ -8,14 +8,18 @@ import socket
 import sys
 import tempfile
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
 import uvicorn
-from playwright.sync_api import sync_playwright
+from playwright.sync_api import Page, sync_playwright
 
 from rafl.calibration.rig import parse_calibration
-from rafl.review.server import create_server
+from rafl.review.calibration.boards import Boards
+from rafl.review.calibration.calls import CalibrationView
+from rafl.review.server import View, create_server
 from rafl.review.tracks.calls import TracksView
 from rafl.review.tracks.recordings import Library
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
@@ -40,26 +44,46 @@ def with_exchanged(tracks: Tracks) -> Tracks:
     return replace(tracks, position=position, sigma=sigma, residual=residual, state=state)
 
 
-def main(demo: Path) -> None:
-    """Make the screenshots from the demonstration in a folder."""
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name) / "tracks"
-        folder.mkdir()
-        for path in (demo / "tracks").glob("*.h5"):
-            write_tracks(folder / path.name, read_tracks(path))
-        write_tracks(folder / f"{RECORDING}.h5", with_exchanged(read_tracks(folder / f"{RECORDING}.h5")))
-        listener = socket.create_server(("127.0.0.1", 0))
-        port = listener.getsockname()[1]
-        app = create_server(TracksView(Library(folder, None, "Ann")), "gallery", port)
-        server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
-        thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
-        thread.start()
+@contextmanager
+def opened(view: View) -> Iterator[Page]:
+    """The page of a view in a browser."""
+    listener = socket.create_server(("127.0.0.1", 0))
+    port = listener.getsockname()[1]
+    app = create_server(view, "gallery", port)
+    server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
+    thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
+    thread.start()
+    try:
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(
                 executable_path=shutil.which("chromium"), args=["--no-sandbox", "--disable-gpu"]
             )
             page = browser.new_page(viewport={"width": 1440, "height": 860})
             page.goto(f"http://127.0.0.1:{port}/?token=gallery")
+            yield page
+            browser.close()
+    finally:
+        server.should_exit = True
+        thread.join()
+
+
+def show_calibration(demo: Path) -> None:
+    """The first board image of the left camera."""
+    with opened(CalibrationView(Boards(demo / "calib.yaml", None, None))) as page:
+        page.wait_for_selector("body[data-examined=yes]", timeout=120_000)
+        page.wait_for_timeout(500)
+        page.screenshot(path=OUT / "review-calibration.png")
+
+
+def show_tracks(demo: Path) -> None:
+    """The list, a recording with two markers exchanged, and the same when they are swapped back."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name) / "tracks"
+        folder.mkdir()
+        for path in (demo / "tracks").glob("*.h5"):
+            write_tracks(folder / path.name, read_tracks(path))
+        write_tracks(folder / f"{RECORDING}.h5", with_exchanged(read_tracks(folder / f"{RECORDING}.h5")))
+        with opened(TracksView(Library(folder, None, "Ann"))) as page:
             page.wait_for_selector("body[data-ready=list]")
             page.wait_for_timeout(1000)
             page.screenshot(path=OUT / "review-list.png", clip={"x": 180, "y": 0, "width": 1080, "height": 330})
@@ -77,9 +101,13 @@ def main(demo: Path) -> None:
             page.screenshot(path=OUT / "review-mended.png")
             page.keyboard.press("?")
             page.locator("#keys").screenshot(path=OUT / "review-keys.png")
-            browser.close()
-        server.should_exit = True
-        thread.join()
+
+
+def main(demo: Path) -> None:
+    """Make the screenshots from the demonstration in a folder."""
+    OUT.mkdir(exist_ok=True)
+    show_calibration(demo)
+    show_tracks(demo)
 
 
 if __name__ == "__main__":

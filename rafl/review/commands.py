@@ -14,6 +14,8 @@ from rafl.common.command_line import one_line
 from rafl.common.errors import InputError
 from rafl.common.interruption import Terminated
 from rafl.common.kernels import announce_compilation
+from rafl.review.calibration.boards import Boards
+from rafl.review.calibration.calls import CalibrationView
 from rafl.review.server import View, create_server
 from rafl.review.tracks.calls import TracksView
 from rafl.review.tracks.recordings import Library
@@ -40,6 +42,20 @@ def open_tracks(tracks: Path, videos: Path | None, who: str) -> TracksView:
     announce_compilation()
     threading.Thread(target=load_kernels, daemon=True).start()
     return TracksView(library)
+
+
+def open_calibration(calib: Path, images: Path | None, board: Path | None) -> CalibrationView:
+    """The view of a calibration.
+
+    Args:
+        calib: calib.yaml.
+        images: folder of board images; None where `rafl-calibrate` found them.
+        board: board description; None for that of `rafl-calibrate`, or with `images`, `board.yaml` in it.
+
+    Raises:
+        InputError: a file cannot be read, or there are no images of these cameras.
+    """
+    return CalibrationView(Boards(calib, images, board))
 
 
 def serve(view: View, port: int, browser: bool) -> None:
@@ -75,4 +91,4 @@ def serve(view: View, port: int, browser: bool) -> None:
         except KeyboardInterrupt as error:
             if isinstance(error, Terminated):
                 raise
-            typer.echo("stopped; all corrections are written")
+            typer.echo("stopped; all that was confirmed is written")

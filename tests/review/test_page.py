@@ -2,14 +2,13 @@
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from filmed import BIT_TOP, BIT_WIDTH, BITS, Film
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 from served import Served
 
 import rafl
@@ -20,10 +19,6 @@ from rafl.capture.specimen.specimen import Specimen
 from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-OPTIONS = "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync"
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed: apt-get install chromium")
 
 Serve = Callable[[Path], str]
 Launch = Callable[[Path], Served]
@@ -39,30 +34,6 @@ READ_COUNTER = f"""(camera) => {{
   }}
   return number;
 }}"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=[*OPTIONS.split(), "--no-first-run"])
-        yield found
-        found.close()
-
-
-@pytest.fixture
-def errors() -> list[str]:
-    return []
-
-
-@pytest.fixture
-def page(browser: Browser, errors: list[str]) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
-    found = context.new_page()
-    found.on("pageerror", lambda error: errors.append(str(error)))
-    found.on("dialog", lambda dialog: errors.append(f"dialog {dialog.message}"))
-    found.set_default_timeout(15_000)
-    yield found
-    context.close()
 
 
 def open_recording(page: Page, address: str, name: str = "swing") -> None:
