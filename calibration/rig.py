@@ -1,18 +1,18 @@
 """`calib.yaml`: the cameras of a rig."""
 
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 import yaml
-from pydantic import AfterValidator, Field, field_validator
+from pydantic import Field, field_validator
 
 from rafl.calibration.camera import Camera, OrthographicCamera, Perspective, PinholeCamera, Plane
 from rafl.calibration.fields import Direction, PositivePair
 from rafl.common.errors import InputError
 from rafl.common.files import write_text
-from rafl.common.names import Name, check_distinct, require_names
+from rafl.common.names import Name, PathInside, check_distinct, require_names
 from rafl.common.yaml_files import StrictModel, parse_yaml_text, read_yaml
 
 FORMAT = "rafl-calibration/1"
@@ -139,19 +139,9 @@ class _PinholeEntry(_Entry):
         )
 
 
-def _check_below(path: str) -> str:
-    parts = PurePosixPath(path)
-    if parts.is_absolute() or ".." in parts.parts or "\\" in path or "\0" in path:
-        raise ValueError("expected a path below the folder of the file")
-    return path
-
-
-_PathBelow = Annotated[str, AfterValidator(_check_below)]
-
-
 class _SourceEntry(StrictModel):
-    images: _PathBelow
-    board: _PathBelow
+    images: PathInside
+    board: PathInside
 
 
 _CameraEntry = Annotated[_OrthographicEntry | _PinholeEntry, Field(discriminator="model")]

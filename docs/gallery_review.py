@@ -13,10 +13,11 @@ from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import uvicorn
 from playwright.sync_api import Page, sync_playwright
 
-from rafl.calibration.rig import parse_calibration
+from rafl.calibration.rig import parse_calibration, read_calibration
 from rafl.review.calibration.boards import Boards
 from rafl.review.calibration.calls import CalibrationView
 from rafl.review.server import View, create_server
@@ -27,6 +28,12 @@ from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
 
 OUT = Path(__file__).parent / "gallery"
 RECORDING, ROW = "load090g", 30
+CORNERS = (
+    (0.0, 0.0, 0.03),
+    (0.0, 0.0, 0.0),
+    (0.0998, 0.0, 0.0234),
+    (0.0972, 0.0, -0.0064),
+)  # of the beam as it hangs [m]
 
 
 def with_exchanged(tracks: Tracks) -> Tracks:
@@ -75,6 +82,33 @@ def show_calibration(demo: Path) -> None:
         page.screenshot(path=OUT / "review-calibration.png")
 
 
+def show_specimen(demo: Path) -> None:
+    """The recording at rest with the corners of the left face, its outline and its dots."""
+    rig = read_calibration(demo / "rest/calib.yaml")
+    with opened(TracksView(Library(demo / "rest/tracks", None, "Ann"), demo)) as page:
+        page.wait_for_selector("body[data-ready=list]")
+        page.get_by_role("link", name="load000g").click()
+        page.wait_for_selector("body[data-ready=recording]")
+        page.get_by_role("link", name="Describe the specimen").click()
+        page.wait_for_selector("body[data-ready=specimen]")
+        for corner in rig.cameras["left"].project(np.array(CORNERS)).tolist():
+            page.mouse.click(
+                *page.evaluate(
+                    """([x, y]) => {
+                      const [view] = window.review.views, box = view.canvas.getBoundingClientRect();
+                      const [u, v] = view.toCanvas(x, y);
+                      return [box.left + u, box.top + v];
+                    }""",
+                    corner,
+                )
+            )
+        page.wait_for_function("() => document.querySelector('#size-x').value !== ''")
+        page.get_by_role("button", name="Find the dots' places").click()
+        page.wait_for_selector("#found:not([hidden])", timeout=120_000)
+        page.wait_for_timeout(500)
+        page.screenshot(path=OUT / "review-specimen.png")
+
+
 def show_tracks(demo: Path) -> None:
     """The list, a recording with two markers exchanged, and the same when they are swapped back."""
     with tempfile.TemporaryDirectory() as name:
@@ -107,6 +141,7 @@ def main(demo: Path) -> None:
     """Make the screenshots from the demonstration in a folder."""
     OUT.mkdir(exist_ok=True)
     show_calibration(demo)
+    show_specimen(demo)
     show_tracks(demo)
 
 

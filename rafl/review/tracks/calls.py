@@ -1,12 +1,14 @@
 """The calls of the page of tracks, each of which reads or corrects one recording."""
 
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import Body, FastAPI, Response
 from fastapi.responses import JSONResponse
 
-from rafl.calibration.rig import Rig, parse_calibration
+from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
+from rafl.review.specimen.calls import add_specimen_calls
 from rafl.review.tracks.blocks import block, series
 from rafl.review.tracks.edits import Action, perform
 from rafl.review.tracks.recording import OpenRecording
@@ -18,30 +20,32 @@ NO_VIDEO = 404
 
 
 class TracksView:
-    """The view of a folder of tracks; see `View`."""
+    """The view of a folder of tracks; see `View`.
+
+    Args:
+        library: the folder.
+        specimens: folder to which specimens that are described on the page are written.
+    """
 
     page = "tracks/tracks.html"
 
-    def __init__(self, library: Library) -> None:
-        self.library = library
+    def __init__(self, library: Library, specimens: Path = Path()) -> None:
+        self.library, self.specimens = library, specimens
         self.title = f"{len(library.names())} recordings in {library.folder}"
 
     def add_calls(self, app: FastAPI) -> None:
         """Add the calls that read and those that correct."""
         _add_reading_calls(app, self.library)
         _add_correcting_calls(app, self.library)
+        add_specimen_calls(app, self._tracks_of, self.specimens)
+
+    def _tracks_of(self, name: str) -> tuple[Path, Rig | None]:
+        found = self.library.open(name)
+        return found.path, found.rig
 
     def close(self) -> None:
         """Close all videos."""
         self.library.close()
-
-
-def _rig(recording: OpenRecording) -> Rig | None:
-    """The cameras with which a recording was tracked; None if the tracks do not hold them."""
-    try:
-        return parse_calibration(recording.raw.calibration, recording.path) if recording.raw.calibration else None
-    except InputError:
-        return None
 
 
 def _state(recording: OpenRecording) -> dict[str, object]:
@@ -82,7 +86,7 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
     @app.get("/api/recording")
     def recording(name: str) -> dict[str, object]:
         found = library.open(name, anew=True)
-        rig = _rig(found)
+        rig = found.rig
         tracks = found.raw
         return _state(found) | {
             "name": name,
@@ -100,7 +104,7 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
     @app.get("/api/block")
     def rows(name: str, first: int, count: int) -> Response:
         found = library.open(name)
-        return Response(block(found, _rig(found), first, count), media_type="application/octet-stream")
+        return Response(block(found, found.rig, first, count), media_type="application/octet-stream")
 
     @app.get("/api/series")
     def values(name: str, marker: int, camera: str) -> Response:

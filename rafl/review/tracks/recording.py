@@ -4,12 +4,14 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.calibration.rig import Rig, parse_calibration
 from rafl.common.errors import InputError
 from rafl.review.server import ReadOnlyError
 from rafl.review.tracks.frames import FrameStore
@@ -56,6 +58,14 @@ class OpenRecording:
         self.stores: dict[str, FrameStore] = {}
         self.opening = threading.Lock()
         self.claim: tuple[str, float] = ("", -np.inf)
+
+    @cached_property
+    def rig(self) -> Rig | None:
+        """The cameras with which it was tracked; None if the tracks do not hold them."""
+        try:
+            return parse_calibration(self.raw.calibration, self.path) if self.raw.calibration else None
+        except InputError:
+            return None
 
     @property
     def tracks(self) -> Tracks:

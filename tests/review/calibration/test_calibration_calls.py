@@ -131,7 +131,7 @@ def test_command_refuses_what_it_cannot_show(tmp_path: Path, calib: Path, run: R
     assert_refused(run("rafl-review", "tracks", "--images", "."), "--images", "calib.yaml")
     for images in ("../elsewhere", "/etc", "a\\..\\b"):
         calib.write_text(text.replace("images: calibration,", f"images: '{images}',"))
-        assert_refused(run("rafl-review", calib), "calibrated_from.images", "a path below the folder")
+        assert_refused(run("rafl-review", calib), "calibrated_from.images", "in the same folder")
     (tmp_path / "link").symlink_to("/etc")
     calib.write_text(text.replace("images: calibration,", "images: link,"))
     assert_refused(run("rafl-review", calib), "link", "elsewhere")

@@ -31,6 +31,7 @@ export class Recording {
 
   async start() {
     $("#title").textContent = this.name;
+    $("#describe").href = `#/specimen/${encodeURIComponent(this.name)}`;
     $("#warning").hidden = true;
     $("#message").textContent = "";
     document.title = `${this.name} - rafl-review`;
