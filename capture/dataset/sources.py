@@ -113,7 +113,15 @@ def _read(path: Path, fps: float, unit: str | None) -> Recording:
             corrections = f"{applied} of {beside.name} {sha256(beside)}"
         position = np.where((tracks.state == MISSING)[..., None], np.nan, tracks.position)
         return Recording(
-            tracks.names, tracks.time, position, tracks.sigma, None, True, source, corrections, "; ".join(found.unfit)
+            tracks.names,
+            tracks.time,
+            position,
+            tracks.sigma,
+            None,
+            True,
+            source,
+            corrections,
+            "; ".join((*found.unfit, *found.doubtful)),
         )
     if path.suffix == ".c3d":
         return _read_c3d(path, source)

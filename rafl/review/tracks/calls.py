@@ -14,6 +14,7 @@ from rafl.review.tracks.edits import Action, perform
 from rafl.review.tracks.recording import OpenRecording
 from rafl.review.tracks.recordings import Library
 from rafl.review.tracks.stretches import find_stretches
+from rafl.tracking.reconstruction.corrected_tracks import is_doubtful
 
 MAX_SUMMARIES = 50  # of one call
 NO_VIDEO = 404
@@ -51,8 +52,9 @@ class TracksView:
 def _state(recording: OpenRecording) -> dict[str, object]:
     """What changes with a correction."""
     entries = [
-        entry.model_dump(mode="json", exclude={"path"})
+        entry.model_dump(mode="json", exclude={"path", "tracks"})
         | ({"frames": len(entry.positions)} if entry.kind == "place" else {})
+        | {"doubtful": is_doubtful(entry, recording.found.digest)}
         for entry in recording.corrections
     ]
     return {
@@ -60,6 +62,7 @@ def _state(recording: OpenRecording) -> dict[str, object]:
         "names": recording.tracks.names,
         "corrections": entries,
         "unfit": recording.found.unfit,
+        "doubtful": recording.found.doubtful,
         "redo": len(recording.undone),
     }
 
@@ -99,6 +102,7 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
                 for camera in tracks.pixel
             ],
             "corrections_file": found.beside.name,
+            "locked": found.locked,
         }
 
     @app.get("/api/block")
@@ -117,7 +121,11 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
     @app.get("/api/frame")
     def frame(name: str, camera: str, number: int) -> Response:
         try:
-            content = library.open(name).frames(camera).jpeg(number)
+            recording = library.open(name)
+            store = recording.frames(camera)
+            if number not in recording.raw.frame[camera]:
+                return JSONResponse({"error": f"the tracks have no frame {number} of camera {camera}"}, NO_VIDEO)
+            content = store.jpeg(number)
         except InputError as error:
             return JSONResponse({"error": str(error)}, NO_VIDEO)
         if content is None:
@@ -127,8 +135,10 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
 
 def _add_correcting_calls(app: FastAPI, library: Library) -> None:
     @app.post("/api/claim")
-    def claim(name: str, page: str) -> dict[str, object]:
+    def claim(name: str, page: str, take: bool = False) -> dict[str, object]:
         found = library.open(name)
+        if take:
+            found.take_over(page)
         return {"writable": found.claim_for(page), "revision": found.revision}
 
     @app.post("/api/release")

@@ -21,10 +21,10 @@ async function route() {
       await open.start();
     }
   } catch (error) {
-    const warning = document.querySelector(kind === "specimen" ? "#specimen-warning" : "#warning");
+    const place = kind === "specimen" ? "#specimen-warning" : "#warning";
     if (!kind) document.querySelector("#recording").hidden = false;
-    warning.hidden = false;
-    warning.textContent = error.message;
+    document.querySelector(place).hidden = false;
+    document.querySelector(kind === "specimen" ? place : "#warning-text").textContent = error.message;
   }
 }
 

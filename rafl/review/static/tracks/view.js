@@ -8,7 +8,7 @@ const CHANGED = "#4cc9ff",
   TRAIL = "#3c96ff";
 const TRAIL_ROWS = 15,
   REACH_PX = 14;
-const ELLIPSES = [60, 200, 0]; // sigmas at which they are drawn
+export const ELLIPSES = [60, 200, 0]; // sigmas at which they are drawn
 
 export class CameraView extends FrameView {
   // calls: select(marker, more), move(camera, marker, x, y, hand), click(camera, x, y) -> whether it was used, activate(camera)
