@@ -40,7 +40,8 @@ def review(
     """Show tracks over their videos in a browser, and let you correct them. Ctrl-C ends it.
 
     Corrections are written to TRACKS/<recording>.corrections.yaml. The tracks files stay as they are. rafl-capture uses
-    the corrections, and rafl-track applies them again.
+    the corrections, and rafl-track applies them again. From a recording at rest, the page makes specimen.yaml, in the
+    folder in which this command was started.
 
     Of a calibration, the board images are shown with what was found in them, its residuals, and the world.
 

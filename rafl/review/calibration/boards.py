@@ -66,8 +66,8 @@ class Boards:
             source = read_board_source(calib)
             if source is None:
                 raise InputError(
-                    f"{calib} does not say where its board images are; give their folder with --images, as it was "
-                    "given to rafl-calibrate"
+                    f"{calib} does not say where its board images are; give their folder with --images (a calibration "
+                    "without a board has none)"
                 )
             if not source.images.is_dir():
                 raise InputError(f"{calib}: expected its board images at {source.images}; give them with --images")

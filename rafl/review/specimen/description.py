@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.calibration.rig import Rig
-from rafl.capture.dataset.sources import read_recording
+from rafl.capture.dataset.sources import recording_of_tracks
 from rafl.capture.description.describe import MEASURED_SIGMA, Description, describe
 from rafl.capture.description.specimen_files import (
     PICTURE_SUFFIX,
@@ -28,10 +28,9 @@ from rafl.common.yaml_files import parse_yaml_text
 from rafl.fem.mesh import HexMesh
 from rafl.review.specimen.corners import projected
 from rafl.tracking.linking.layout import SPECIMEN_FORMAT
+from rafl.tracking.reconstruction.corrected_tracks import CorrectedTracks
 
 Array = NDArray[Any]
-
-UNUSED_FPS = 100.0  # tracks have their own times
 
 
 @dataclass(frozen=True)
@@ -89,11 +88,12 @@ class DescribedSpecimen:
         }
 
 
-def describe_tracks(path: Path, form: BodyForm) -> DescribedSpecimen:
-    """Describe the specimen that a tracks file shows at rest, as `rafl-specimen` does.
+def describe_tracks(tracks: CorrectedTracks, path: Path, form: BodyForm) -> DescribedSpecimen:
+    """Describe the specimen that tracks show at rest, as `rafl-specimen` does.
 
     Args:
-        path: of the tracks, which are read with their corrections.
+        tracks: of the recording.
+        path: that they were read from.
         form: the body.
 
     Raises:
@@ -101,7 +101,7 @@ def describe_tracks(path: Path, form: BodyForm) -> DescribedSpecimen:
     """
     torch.set_num_threads(1)
     body = _body("specimen", form)
-    recording = read_recording(path, UNUSED_FPS)
+    recording = recording_of_tracks(tracks, path)
     names = recording.names or ()
     if unknown := [name for name in form.left_out if name not in names]:
         raise InputError(f"expected dots of {path.stem}, found {unknown[0]!r:.80}; load the page again")

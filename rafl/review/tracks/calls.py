@@ -6,9 +6,8 @@ from typing import Annotated
 from fastapi import Body, FastAPI, Response
 from fastapi.responses import JSONResponse
 
-from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
-from rafl.review.specimen.calls import add_specimen_calls
+from rafl.review.specimen.calls import ShownTracks, add_specimen_calls
 from rafl.review.tracks.blocks import block, series
 from rafl.review.tracks.edits import Action, perform
 from rafl.review.tracks.recording import OpenRecording
@@ -40,9 +39,9 @@ class TracksView:
         _add_correcting_calls(app, self.library)
         add_specimen_calls(app, self._tracks_of, self.specimens)
 
-    def _tracks_of(self, name: str) -> tuple[Path, Rig | None]:
-        found = self.library.open(name)
-        return found.path, found.rig
+    def _tracks_of(self, name: str) -> ShownTracks:
+        recording = self.library.open(name)
+        return ShownTracks(recording.path, recording.found, recording.rig)
 
     def close(self) -> None:
         """Close all videos."""

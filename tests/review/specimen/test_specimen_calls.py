@@ -1,6 +1,7 @@
 """The calls by which a specimen is described: sizes from corners, places, and what is written."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,10 @@ import pytest
 from starlette.testclient import TestClient
 from stills import SIDES, SIZE_MM, STILL_RIG, corner_pixels, still_tracks
 
+from rafl.calibration.camera import OrthographicCamera, Plane
+from rafl.calibration.rig import Rig
 from rafl.capture.specimen.specimen import read_specimen
+from rafl.common.errors import InputError
 from rafl.review.server import create_server
 from rafl.review.specimen.corners import measure_body
 from rafl.review.tracks.calls import TracksView
@@ -47,6 +51,21 @@ def test_a_world_that_is_not_the_specimens_frame_is_told() -> None:
     moved = corner_pixels("left") + 60.0
     (remark,) = measure_body(STILL_RIG, {"left": moved}).remarks
     assert "17.0 mm from the world's origin" in remark
+
+
+def test_a_camera_above_tells_the_width() -> None:
+    """It films the upper face, 100 mm x 20 mm, of a body that lies; the height stays unknown."""
+    above = OrthographicCamera(
+        image_size=(640, 240), scale=(5000.0, 5000.0), offset=(70.0, 170.0), rotation_vector=(np.pi, 0.0, 0.0),
+        plane=Plane((0.0, 0.0, 1.0), 0.02, 5e-4),
+    )  # fmt: skip
+    ends = np.array([(x, y, 0.02) for x in (0.0, 0.1) for y in (0.0, 0.02)])
+    found = measure_body(Rig({"above": above}), {"above": above.project(ends)})
+    assert found.size_mm == (100.0, 20.0, None)
+    assert found.remarks == ("the corners do not tell the height: measure and type it",)
+    tip = replace(above, plane=Plane((1.0, 0.0, 0.0), 0.1, 5e-4))
+    with pytest.raises(InputError, match="films an end of the body"):
+        measure_body(Rig({"tip": tip}), {"tip": above.project(ends)})
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import { listFacts, listImages, drawHistogram } from "/static/calibration/panels
 
 const MAGNIFICATIONS = [10, 20, 50, 100, 200, 500, 1000, 2000];
 const AUTO = "auto";
-const ARROW_PX = 40; // of the largest usual arrow
+const ARROW_PX = 60; // of the largest usual arrow
 const IMAGES = 24; // kept
 const ALL = ""; // the name under which all images of a camera are shown together
 const $ = (selector) => document.querySelector(selector);
