@@ -23,7 +23,7 @@ from rafl.tracking.video.reader import Video, is_video, open_video
 Result = TypeVar("Result")
 
 # Recordings whose tracks and frames are kept in memory: those that no page uses, and all.
-MAX_UNUSED, MAX_OPEN = 3, 12
+MAX_UNUSED, MAX_OPEN = 3, 8
 
 
 class Library:

@@ -24,11 +24,12 @@ ON_SCREEN = """([camera, x, y]) => {
 }"""
 
 
-def open_specimen(page: Page, tmp_path: Path, serve_view: ServeView) -> None:
-    write_tracks(tmp_path / "tracks/still.h5", still_tracks())
+def open_specimen(page: Page, tmp_path: Path, serve_view: ServeView, name: str = "still") -> None:
+    if name == "still":
+        write_tracks(tmp_path / "tracks/still.h5", still_tracks())
     page.goto(serve_view(TracksView(Library(tmp_path / "tracks", None, "Ann"), tmp_path)))
     page.wait_for_selector("body[data-ready=list]")
-    page.get_by_role("link", name="still", exact=True).click()
+    page.get_by_role("link", name=name, exact=True).click()
     page.wait_for_selector("body[data-ready=recording]")
     page.get_by_role("link", name="Describe the specimen").click()
     page.wait_for_selector("body[data-ready=specimen]")
@@ -97,4 +98,24 @@ def test_corners_are_dragged_cleared_and_dots_unticked(
     page.get_by_role("button", name="Write").click()
     page.wait_for_function("() => document.querySelector('#specimen-message').textContent.includes('without slashes')")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["tracks"]
+    assert errors == []
+
+
+def test_hostile_names_do_nothing(tmp_path: Path, serve_view: ServeView, page: Page, errors: list[str]) -> None:
+    tracks = still_tracks()
+    names = ("<img src=x onerror=alert(1)>", "'\"&amp;${alert(1)}", *tracks.names[2:])
+    object.__setattr__(tracks, "names", names)
+    name = "<b onclick=alert(1)>still"
+    write_tracks(tmp_path / f"tracks/{name}.h5", tracks)
+    open_specimen(page, tmp_path, serve_view, name)
+    assert page.locator("#specimen-title").inner_text() == name
+    for side, value in zip("xyz", SIZE_MM, strict=True):
+        page.fill(f"#size-{side}", str(value))
+    find(page)
+    assert "<img src=x onerror=alert(1)>" in page.locator("#dots").inner_text()
+    page.fill("#specimen-file", "<script>alert(1)<")
+    page.get_by_role("button", name="Write").click()
+    page.wait_for_function("() => document.querySelector('#written').textContent.startsWith('Wrote')")
+    assert read_specimen(tmp_path / "<script>alert(1)<.yaml").name == "-script-alert-1--"
+    assert page.locator("main img, main script, main b").count() == 0
     assert errors == []
