@@ -91,4 +91,4 @@ def serve(view: View, port: int, browser: bool) -> None:
         except KeyboardInterrupt as error:
             if isinstance(error, Terminated):
                 raise
-            typer.echo("stopped; all that was confirmed is written")
+            typer.echo("stopped; nothing is left to save")
