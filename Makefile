@@ -56,6 +56,9 @@ docs: install build/types
 
 # The pictures of the site's gallery, from the demonstration's output.
 gallery: demo
+	$(BIN)/rafl-render datasets/specimens/canonical.yaml --out $(DEMO)/rest --loads-g 0 --frames 12
+	$(BIN)/rafl-calibrate $(DEMO)/rest/calibration --out $(DEMO)/rest/calib.yaml
+	$(BIN)/rafl-track $(DEMO)/rest/videos --calib $(DEMO)/rest/calib.yaml --out $(DEMO)/rest/tracks
 	$(BIN)/python docs/gallery.py $(DEMO)
 	$(BIN)/python docs/gallery_review.py $(DEMO)
 	$(BIN)/python docs/gallery_results.py $(DEMO)

@@ -1,8 +1,9 @@
 """Board images in a folder: their cameras, and the views of the board that they show."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
-from rafl.calibration.board import MIN_POINTS, BoardFile, View
+from rafl.calibration.board import MIN_POINTS, BoardFile, Detection, View
 from rafl.calibration.detection.image_file import image_size, read_grey_image
 from rafl.common.command_line import progress
 from rafl.common.errors import InputError
@@ -12,6 +13,21 @@ IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp"}
 
 Views = dict[str, list[View]]
 Sizes = dict[str, tuple[int, int]]
+
+
+@dataclass(frozen=True)
+class FoundBoard:
+    """What an image shows of the board.
+
+    Attributes:
+        view: None if the image does not serve.
+        reason: why it does not; empty if it does.
+        detection: what was found.
+    """
+
+    view: View | None
+    reason: str
+    detection: Detection
 
 
 def board_views(images: Path, description: BoardFile) -> tuple[Views, Sizes]:
@@ -25,7 +41,7 @@ def board_views(images: Path, description: BoardFile) -> tuple[Views, Sizes]:
     """
     if not images.is_dir():
         raise InputError(f"expected a folder of board images at {images}, found none; check the path")
-    paths = _image_paths(images)
+    paths = image_paths(images)
     _check_named_images(description, paths, images)
     if copies := find_copies(path for own in paths.values() for path in own.values()):
         raise InputError(f"expected different images, found {copies[0]} in {copies[1]} again; remove one")
@@ -54,8 +70,12 @@ def check_shared_world(views: Views) -> None:
         )
 
 
-def _image_paths(images: Path) -> dict[str, dict[str, Path]]:
-    """Image paths by camera and by `camera/file`. A folder without subfolders is one camera."""
+def image_paths(images: Path) -> dict[str, dict[str, Path]]:
+    """Image paths by camera and by `camera/file`. A folder without subfolders is one camera.
+
+    Raises:
+        InputError: there are no images.
+    """
     folders = sorted(path for path in images.iterdir() if path.is_dir())
     found = {
         folder.name: {
@@ -112,24 +132,19 @@ def _find_views(camera: str, paths: dict[str, Path], description: BoardFile) -> 
     if len(sizes) > 1:
         found = ", ".join(f"{name} {w} x {h}" for (w, h), name in sizes.items())
         raise InputError(f"camera {camera}: expected images of one size, found {found}; remove the others")
-    placed = {*description.world, *(name for move in description.moved for name in (move.from_, move.to))}
     views: list[View] = []
     other_size: list[tuple[str, tuple[int, int]]] = []
     with progress() as bar:
         for name, path in bar.track(paths.items(), description=f"{camera}: finding the board"):
-            found_board = description.pattern.find(read_grey_image(path))
-            if found_board.other_size:
-                other_size.append((name, found_board.other_size))
-            needs_origin = description.simultaneous or name in placed
-            if len(found_board.points) >= MIN_POINTS and (found_board.origin_known or not needs_origin):
-                pose_key = name.partition("/")[2] if description.simultaneous else name
-                own = (found_board.points, found_board.pixels, description.world.get(name), found_board.origin_known)
-                views.append(View(name, pose_key, *own))
+            shown = find_board(name, path, description)
+            if shown.detection.other_size:
+                other_size.append((name, shown.detection.other_size))
+            if shown.view is not None:
+                views.append(shown.view)
             elif name in description.world:
-                part = "only a part of a board without its origin" if len(found_board.points) else "no board"
                 raise InputError(
-                    f"{path}: board.yaml gives the pose of the board in this image, but {part} was found there; "
-                    "check the pattern in board.yaml, or take the image again"
+                    f"{path}: board.yaml gives the pose of the board in this image, but {shown.reason}; check the "
+                    "pattern in board.yaml, or take the image again"
                 )
     if len(other_size) > sum(view.origin_known for view in views):
         name, (columns, rows) = other_size[0]
@@ -138,3 +153,31 @@ def _find_views(camera: str, paths: dict[str, Path], description: BoardFile) -> 
             "correct the pattern in board.yaml (of a chessboard, the inner corners count)"
         )
     return views, next(iter(sizes))
+
+
+def find_board(name: str, path: Path, description: BoardFile) -> FoundBoard:
+    """Find the board in an image.
+
+    Args:
+        name: `camera/file`.
+        path: of the image.
+        description: of the board.
+
+    Raises:
+        InputError: the file is damaged, no image, or too large.
+    """
+    found = description.pattern.find(read_grey_image(path))
+    count = len(found.points)
+    placed = {*description.world, *(name for move in description.moved for name in (move.from_, move.to))}
+    if found.other_size:
+        columns, rows = found.other_size
+        return FoundBoard(None, f"a board of {columns} x {rows} points was found there", found)
+    if not count:
+        return FoundBoard(None, "no board was found there", found)
+    if count < MIN_POINTS:
+        return FoundBoard(None, f"only {count} points of the board were found there, fewer than {MIN_POINTS}", found)
+    if not found.origin_known and (description.simultaneous or name in placed):
+        return FoundBoard(None, "only a part of a board without its origin was found there", found)
+    pose_key = name.partition("/")[2] if description.simultaneous else name
+    known = description.world.get(name)
+    return FoundBoard(View(name, pose_key, found.points, found.pixels, known, found.origin_known), "", found)

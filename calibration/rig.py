@@ -10,11 +10,13 @@ from pydantic import Field, field_validator
 
 from rafl.calibration.camera import Camera, OrthographicCamera, Perspective, PinholeCamera, Plane
 from rafl.calibration.fields import Direction, PositivePair
+from rafl.common.errors import InputError
 from rafl.common.files import write_text
-from rafl.common.names import Name, check_distinct, require_names
+from rafl.common.names import Name, PathInside, check_distinct, require_names
 from rafl.common.yaml_files import StrictModel, parse_yaml_text, read_yaml
 
 FORMAT = "rafl-calibration/1"
+LABEL = "a calibration (calib.yaml)"
 PLANE_SIGMA_MM = 0.5  # of the markers' distances from their plane, unless given
 
 
@@ -30,6 +32,19 @@ class Rig:
 
     def __post_init__(self) -> None:
         require_names(self.cameras, "cameras")
+
+
+@dataclass(frozen=True)
+class BoardSource:
+    """What a rig was calibrated from.
+
+    Attributes:
+        images: folder with one subfolder of board images per camera.
+        board: description of the board.
+    """
+
+    images: Path
+    board: Path
 
 
 class _PlaneEntry(StrictModel):
@@ -124,11 +139,17 @@ class _PinholeEntry(_Entry):
         )
 
 
+class _SourceEntry(StrictModel):
+    images: PathInside
+    board: PathInside
+
+
 _CameraEntry = Annotated[_OrthographicEntry | _PinholeEntry, Field(discriminator="model")]
 
 
 class _RigFile(StrictModel):
     format: str
+    calibrated_from: _SourceEntry | None = None
     cameras: dict[Name, _CameraEntry] = Field(min_length=1)
 
     @field_validator("cameras")
@@ -138,6 +159,22 @@ class _RigFile(StrictModel):
         return value
 
 
+def read_board_source(path: Path) -> BoardSource | None:
+    """The board images from which `calib.yaml` was made; None if it does not name them.
+
+    Raises:
+        InputError: the file is missing, damaged or of a newer version, or names a folder elsewhere.
+    """
+    entry = read_yaml(path, _RigFile, LABEL, FORMAT).calibrated_from
+    if entry is None:
+        return None
+    source = BoardSource(path.parent / entry.images, path.parent / entry.board)
+    for part in (source.images, source.board):  # a link may lead elsewhere
+        if not part.resolve().is_relative_to(path.parent.resolve()):
+            raise InputError(f"{path}: expected board images in its folder, found {part} elsewhere; copy them there")
+    return source
+
+
 def read_calibration(path: str | Path) -> Rig:
     """Read `calib.yaml`.
 
@@ -145,7 +182,7 @@ def read_calibration(path: str | Path) -> Rig:
         InputError: the file is missing, damaged or of a newer version.
     """
     path = Path(path)
-    content = read_yaml(path, _RigFile, "a calibration (calib.yaml)", FORMAT)
+    content = read_yaml(path, _RigFile, LABEL, FORMAT)
     return Rig({name: entry.camera() for name, entry in content.cameras.items()})
 
 
@@ -163,10 +200,13 @@ def parse_calibration(text: str, source: Path) -> Rig:
     return Rig({name: entry.camera() for name, entry in content.cameras.items()})
 
 
-def rig_text(rig: Rig) -> str:
-    """The content of `calib.yaml`."""
+def rig_text(rig: Rig, calibrated_from: dict[str, str] | None = None) -> str:
+    """The content of `calib.yaml`; `calibrated_from` holds the paths of the images and of the board."""
     cameras = {name: _to_python(_entry(camera)) for name, camera in rig.cameras.items()}
-    return yaml.safe_dump({"format": FORMAT, "cameras": cameras}, sort_keys=False, default_flow_style=None)
+    content: dict[str, object] = {"format": FORMAT}
+    if calibrated_from is not None:
+        content["calibrated_from"] = calibrated_from
+    return yaml.safe_dump(content | {"cameras": cameras}, sort_keys=False, default_flow_style=None)
 
 
 def _to_python(value: Any) -> Any:
@@ -219,7 +259,21 @@ def _entry(camera: Camera) -> dict[str, object]:
     return entry
 
 
-def write_calibration(path: str | Path, rig: Rig) -> None:
-    """Write `calib.yaml`, completely or not at all."""
+def write_calibration(path: str | Path, rig: Rig, source: BoardSource | None = None) -> None:
+    """Write `calib.yaml`, completely or not at all.
+
+    Args:
+        path: of the file.
+        rig: the cameras.
+        source: what they were calibrated from. The file names it if it lies below the file's folder.
+    """
     path = Path(path)
-    write_text(path, rig_text(rig))
+    write_text(path, rig_text(rig, None if source is None else _paths_below(source, path.parent)))
+
+
+def _paths_below(source: BoardSource, folder: Path) -> dict[str, str] | None:
+    """The paths of a source as seen from a folder that contains it; None if the folder does not."""
+    parts = {"images": source.images.resolve(), "board": source.board.resolve()}
+    if not all(part.is_relative_to(folder.resolve()) for part in parts.values()):
+        return None
+    return {key: part.relative_to(folder.resolve()).as_posix() for key, part in parts.items()}

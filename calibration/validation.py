@@ -72,6 +72,14 @@ def check_view(camera: Camera, view: View) -> CheckedView:
     return CheckedView(view, residuals(best.x).reshape(-1, 2))
 
 
+def check_known_pose(camera: Camera, view: View) -> CheckedView | None:
+    """The residuals of a view with the board where `board.yaml` says; None if it does not say."""
+    if view.known_pose is None:
+        return None
+    world = view.known_pose.origin + view.points @ view.known_pose.rotation[:, :2].T
+    return CheckedView(view, view.pixels - camera.project(world))
+
+
 def write_residual_plot(path: Path, size: tuple[int, int], checked: list[CheckedView], title: str) -> None:
     """Write a PNG of one camera's residuals: enlarged arrows over the image area, and a histogram."""
     figure = Figure(figsize=(11, 4.6), layout="constrained")

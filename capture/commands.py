@@ -1,6 +1,5 @@
 """What `rafl-render`, `rafl-specimen` and `rafl-capture` do once their options are checked: call, print and write."""
 
-import re
 from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,9 +15,20 @@ from rafl.capture.dataset.settings import CaptureSettings as CaptureSettings
 from rafl.capture.dataset.sources import read_recording
 from rafl.capture.dataset.summary import print_contents, recordings_table, warnings
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
-from rafl.capture.description.describe import Description, describe
-from rafl.capture.description.drawing import draw_description
-from rafl.capture.description.specimen_text import body_like, body_of_box, body_of_surface, specimen_text
+from rafl.capture.description.describe import MEASURED_SIGMA, describe
+from rafl.capture.description.specimen_files import (
+    description_summary,
+    description_warnings,
+    specimen_files,
+    uncertain_sag,
+)
+from rafl.capture.description.specimen_text import (
+    body_like,
+    body_of_box,
+    body_of_surface,
+    specimen_name,
+    specimen_text,
+)
 from rafl.capture.description.stencil import design_stencil, stencil_pdf
 from rafl.capture.registration.initial import MODULUS_SIGMA
 from rafl.capture.registration.registration import RestPose as RestPose
@@ -37,8 +47,6 @@ from rafl.data.markers import Markers
 from rafl.fem.material import modulus_hint
 
 UNUSED_FPS = 100.0  # of a recording at rest without times
-MEASURED_SIGMA = 0.1  # standard deviation of log E that a user gives: tensile tests of soft rubber differ by so much
-UNCERTAIN_MM = 1.0  # a larger standard deviation of a place is worth a note [mm]: rulers are better
 DRAWN_MM = 2.0  # largest distance from the skin of the mesh at which a marker is drawn [mm]
 
 
@@ -177,52 +185,22 @@ def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str |
     """
     torch.set_num_threads(1)
     announce_compilation()
-    body = given.read(_specimen_name(out), out.parent)
+    body = given.read(specimen_name(out), out.parent)
     recording = read_recording(still, UNUSED_FPS, unit)
     try:
         sigma = MODULUS_SIGMA if given.youngs_modulus is None else MEASURED_SIGMA
         found = describe(recording, body, out.parent, lying, str(still), sigma)
     except SimulationError as error:
         raise InputError(f"the body cannot bear its own weight: {error}; check its size and --youngs-modulus") from None
-    places, sigmas = 1e3 * found.undeformed.carried.rest + 0.0, 1e3 * found.undeformed.sigma
-    markers: list[dict[str, object]] = [
-        {
-            "name": found.names[k],
-            "at_mm": [round(float(x), 2) for x in places[k]],
-            "at_sigma_mm": round(float(sigmas[k]), 2),
-        }
-        for k in found.listed
-    ]
-    assumed = "Poisson's ratio is" if given.density else "density and Poisson's ratio are"
-    remarks = {
-        "": f"Described from {still.name} by rafl-specimen. Look at {out.with_suffix('.png').name}.",
-        "material": f"To check: {assumed} assumed. Young's modulus {_modulus_text(found)}.",
-        "clamp": "To check: the face that is held, and the face on which loads hang.",
-        "markers": "Places on the undeformed body. A place that you measured better replaces the one found here.",
-    }
-    drawing = draw_description(found, f"{body.name}, from {still.name}")
-    text = specimen_text(body.with_material(youngs_modulus=found.youngs_modulus), markers, remarks)
-    with written_files({out.with_suffix(".png"): drawing, out: text}):
+    with written_files(specimen_files(found, body, still.name, out, bool(given.density))):
         pass
-    for name, distance in found.left_out.items():
-        typer.echo(
-            f"warning: dot {name} lies {1e3 * distance:.1f} mm off every face and was left out; if it is on the "
-            "specimen, the size of the body is wrong",
-            err=True,
-        )
-    typer.echo(f"{len(markers)} dots, places to {sigmas.max():.2f} mm; Young's modulus {_modulus_text(found)}")
-    if not lying and sigmas.max() > UNCERTAIN_MM:
-        typer.echo(
-            "note: the dots do not tell well how far the specimen sags; lay it flat (--lying), or measure its Young's "
-            "modulus (--youngs-modulus)"
-        )
+    for line in description_warnings(found):
+        typer.echo(f"warning: {line}", err=True)
+    typer.echo(description_summary(found))
+    if note := uncertain_sag(found, lying):
+        typer.echo(f"note: {note} (--lying, --youngs-modulus)")
     typer.echo(f"wrote {out} and {out.with_suffix('.png')}")
     typer.echo(f"next: rafl-track videos/ --calib calib.yaml --specimen {out}")
-
-
-def _modulus_text(found: Description) -> str:
-    modulus, sigma = 1e-3 * found.youngs_modulus, 100.0 * found.undeformed.modulus_sigma
-    return f"{modulus:.3g} kPa +- {sigma:.0f} %, {'from the sag' if found.sag_tells else 'assumed'}"
 
 
 def stencil(size_mm: tuple[float, float, float], dot_mm: float, out: Path) -> None:
@@ -233,7 +211,7 @@ def stencil(size_mm: tuple[float, float, float], dot_mm: float, out: Path) -> No
     """
     layout = design_stencil(size_mm, dot_mm)
     description = out.with_suffix(".yaml")
-    body = body_of_box(_specimen_name(out), size_mm, None)
+    body = body_of_box(specimen_name(out), size_mm, None)
     remarks = {
         "": f"Dots of {out.name}, drawn by rafl-specimen.",
         "material": "To check: all of it is assumed.",
@@ -245,11 +223,6 @@ def stencil(size_mm: tuple[float, float, float], dot_mm: float, out: Path) -> No
     count = sum(len(item.markers()) for item in layout.markers)
     typer.echo(f"wrote {out} ({count} dots of {dot_mm:g} mm) and {description}")
     typer.echo("next: print at 100 %, measure the scale bar, put the dots on the specimen, and film it")
-
-
-def _specimen_name(path: Path) -> str:
-    """The name of a specimen whose file has this path."""
-    return re.sub(r"[^\w.-]", "-", path.stem)
 
 
 def capture(

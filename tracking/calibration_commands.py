@@ -15,7 +15,7 @@ from rafl.calibration.detection.image_file import read_grey_image
 from rafl.calibration.foreign.placement import KnownPoints, place_rig
 from rafl.calibration.foreign.read import read_any_calibration
 from rafl.calibration.rest_pose import camera_from_points
-from rafl.calibration.rig import Rig, write_calibration
+from rafl.calibration.rig import BoardSource, Rig, read_board_source, write_calibration
 from rafl.calibration.solve import solve_rig
 from rafl.calibration.summary import camera_table, check_table, perspective_messages
 from rafl.calibration.validation import check_view, write_residual_plot
@@ -58,7 +58,7 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
         for name, camera in solution.rig.cameras.items()
     }
     with written_files(pictures):
-        write_calibration(out, solution.rig)
+        write_calibration(out, solution.rig, BoardSource(images, board))
     Console(width=110).print(camera_table(solution, views))
     for name, camera in solution.rig.cameras.items():
         if camera.residual > LARGE_RESIDUAL_PX:
@@ -70,6 +70,8 @@ def calibrate(images: Path, board: Path, model: str, tilt_sign: list[str], depth
     for line in perspective_messages(solution, depth, model):
         typer.echo(line)
     typer.echo(f"wrote {', '.join(map(str, pictures))}: check the origin and the axes of the world there")
+    where = "" if read_board_source(out) else f" --images {images} --board {board}"
+    typer.echo(f"all images with their residuals: rafl-review {out}{where}")
     _print_next(out)
 
 

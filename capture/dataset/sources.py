@@ -17,7 +17,7 @@ from rafl.common.files import sha256
 from rafl.common.names import require_names
 from rafl.common.units import METRES
 from rafl.data.views import View
-from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
+from rafl.tracking.reconstruction.corrected_tracks import CorrectedTracks, read_corrected_tracks
 from rafl.tracking.reconstruction.corrections import corrections_path
 from rafl.tracking.reconstruction.gap_filling import MEASURED, MISSING
 from rafl.tracking.reconstruction.tracks import Tracks
@@ -71,7 +71,19 @@ def read_recording(path: Path, fps: float, unit: str | None = None) -> Recording
     Raises:
         InputError: the file cannot be read, has another shape, or its times or numbers make no recording.
     """
-    recording = _read(path, fps, unit)
+    return _checked(_read(path, fps, unit), path)
+
+
+def recording_of_tracks(found: CorrectedTracks, path: Path) -> Recording:
+    """The recording that tracks hold, which were read from `path`.
+
+    Raises:
+        InputError: their times or numbers make no recording.
+    """
+    return _checked(_from_tracks(found, path), path)
+
+
+def _checked(recording: Recording, path: Path) -> Recording:
     try:
         _check(recording)
     except ValueError as error:
@@ -106,28 +118,23 @@ def _check(recording: Recording) -> None:
         raise ValueError(f"expected a sigma of at least {LEAST_SIGMA:g} m for every position, found another")
 
 
-def _read(path: Path, fps: float, unit: str | None) -> Recording:
+def _from_tracks(found: CorrectedTracks, path: Path) -> Recording:
+    tracks, corrections = found.tracks, ""
+    if found.corrections:
+        beside = corrections_path(path)
+        applied = len(found.corrections) - len(found.unfit)
+        corrections = f"{applied} of {beside.name} {sha256(beside)}"
+    position = np.where((tracks.state == MISSING)[..., None], np.nan, tracks.position)
+    unfit = "; ".join((*found.unfit, *found.doubtful))
     source = f"{path.name} {sha256(path)}"
+    views = _read_views(tracks, path)
+    return Recording(tracks.names, tracks.time, position, tracks.sigma, None, True, source, corrections, unfit, views)
+
+
+def _read(path: Path, fps: float, unit: str | None) -> Recording:
     if path.suffix == ".h5":
-        found = read_corrected_tracks(path)
-        tracks, corrections = found.tracks, ""
-        if found.corrections:
-            beside = corrections_path(path)
-            applied = len(found.corrections) - len(found.unfit)
-            corrections = f"{applied} of {beside.name} {sha256(beside)}"
-        position = np.where((tracks.state == MISSING)[..., None], np.nan, tracks.position)
-        return Recording(
-            tracks.names,
-            tracks.time,
-            position,
-            tracks.sigma,
-            None,
-            True,
-            source,
-            corrections,
-            "; ".join(found.unfit),
-            _read_views(tracks, path),
-        )
+        return _from_tracks(read_corrected_tracks(path), path)
+    source = f"{path.name} {sha256(path)}"
     if path.suffix == ".c3d":
         return _read_c3d(path, source)
     return _read_npy(path, fps, source) if path.suffix == ".npy" else _read_table(path, fps, unit, source)

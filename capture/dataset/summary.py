@@ -71,7 +71,7 @@ def warnings(dataset: Dataset) -> list[str]:
                 "at_mm, or the names in the tracks"
             )
         if unfit := item.attributes.get("unfit_corrections"):
-            lines.append(f"recording {name}: {unfit}; correct it in rafl-review")
+            lines.append(f"recording {name}: {unfit}; see rafl-review")
         start, not_free = (int(str(item.attributes.get(key, 0))) for key in ("first_frame", "not_free_frames"))
         if not_free:
             lines.append(

@@ -22,6 +22,7 @@ from rafl.tracking.linking.naming import is_row_name
 
 Array = NDArray[Any]
 
+MEASURED_SIGMA = 0.1  # standard deviation of log E that a user gives: tensile tests of soft rubber differ by so much
 MAX_POSE_SIGMA = 1e-3  # largest standard deviation of a dot's place that an unknown frame may leave [m]
 UNKNOWN_POSE_SIGMA = 1e-2  # of the height and tilt of a body whose frame is found with E in turn [m]
 MAX_MODULUS_SIGMAS = 3.0  # E farther off the assumed one contradicts it [standard deviations of log E]

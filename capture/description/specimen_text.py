@@ -1,6 +1,7 @@
 """The text of a specimen file, and the body that a size or a surface describes."""
 
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -89,6 +90,11 @@ def _body(name: str, shape: dict[str, object]) -> Body:
             "load": {"face": "x-max"},
         }
     )
+
+
+def specimen_name(path: Path) -> str:
+    """The name of a specimen whose file has this path."""
+    return re.sub(r"[^\w.-]", "-", path.stem)
 
 
 def relative_path(path: Path, folder: Path) -> str:

@@ -23,7 +23,7 @@ class Recording:
         in_specimen_frame: whether a calibration has put the positions into the specimen frame.
         source: file name and SHA-256.
         corrections: how many corrections by a person the positions contain, their file and its SHA-256.
-        unfit_corrections: those that do not fit the tracks and were left out.
+        unfit_corrections: those that do not fit the tracks and were left out, or that were made on other tracks.
         views: what each camera measured, by its name, with the camera in the frame of the file; empty if not known.
     """
 

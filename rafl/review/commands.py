@@ -14,31 +14,37 @@ from rafl.common.command_line import one_line
 from rafl.common.errors import InputError
 from rafl.common.interruption import Terminated
 from rafl.common.kernels import announce_compilation
+from rafl.review.calibration.boards import Boards
+from rafl.review.calibration.calls import CalibrationView
+from rafl.review.kinds import CALIBRATION, TRACKS, kind_of
 from rafl.review.server import View, create_server
 from rafl.review.tracks.calls import TracksView
 from rafl.review.tracks.recordings import Library
 from rafl.tracking.single_marker import load_kernels
 
 HOST = "127.0.0.1"
-RUN_FILES = ("model.pt", "evaluation.h5")  # by which a run folder is told from a folder of tracks
 SHUTDOWN_S = 2  # for requests that are being answered when the command is stopped
 
 
-def open_view(path: Path, videos: Path | None, who: str) -> View:
+def open_view(path: Path, videos: Path | None, who: str, images: Path | None = None, board: Path | None = None) -> View:
     """The view of a path.
 
     Args:
-        path: dataset, run folder or folder of tracks.
-        videos: folder of videos of tracks; None where `rafl-track` found them.
-        who: name for corrections of tracks.
+        path: folder of tracks, calibration, run folder or dataset.
+        videos: of tracks: folder of the videos; None where `rafl-track` found them.
+        who: of tracks: name for corrections.
+        images: of a calibration: folder of board images; None where `rafl-calibrate` found them.
+        board: of a calibration: board description; None for that of `rafl-calibrate`, or with `images`, `board.yaml`
+            in it.
 
     Raises:
         InputError: there is nothing of the kind, or it cannot be read.
     """
-    if path.is_dir() and not any((path / name).exists() for name in RUN_FILES):
+    kind = kind_of(path)
+    if kind == TRACKS:
         return open_tracks(path, videos, who)
-    if videos is not None:
-        raise InputError(f"--videos: expected a folder of tracks beside it, found {path}; leave the option out")
+    if kind == CALIBRATION:
+        return CalibrationView(Boards(path, images, board))
     from rafl.review.results.calls import ResultsView  # takes seconds, which tracks need not wait for
 
     return ResultsView.of_run(path) if path.is_dir() else ResultsView.of_dataset(path)
@@ -99,4 +105,4 @@ def serve(view: View, port: int, browser: bool) -> None:
         except KeyboardInterrupt as error:
             if isinstance(error, Terminated):
                 raise
-            typer.echo("stopped; nothing is left to save")
+            typer.echo("stopped; all that was confirmed is written")

@@ -1,7 +1,9 @@
 """A small laboratory: one good file of every format that the commands read."""
 
 import io
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import av
 import cv2
@@ -23,8 +25,17 @@ from rafl.fem.material import Material
 from rafl.fitting.run_folder import FittedModel, save_model
 from rafl.residual.acceleration_field import ResidualField
 from rafl.simulation.simulator import Simulator
+from rafl.tracking.reconstruction.corrections import (
+    Accept,
+    Delete,
+    Place,
+    Swap,
+    corrections_path,
+    path_text,
+    write_corrections,
+)
 from rafl.tracking.reconstruction.export import WRITERS
-from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
+from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
 
 FRAMES = 8
 SIZE = (200, 160)  # of the video [px]
@@ -89,8 +100,25 @@ def _write_motions(folder: Path) -> None:
             path.parent.mkdir(exist_ok=True)
             write(path, tracks, {})
         write_tracks(folder / "tracks" / f"{name}.h5", tracks)
+    _write_corrections(folder / "tracks" / "take1.h5")
     write_dataset(folder / "data.h5", _dataset(specimen.simulator(0.01), markers, starts, positions))
     save_model(folder / "field", FittedModel("rafl", ResidualField(), {"youngs_modulus": 160e3}))
+
+
+def _write_corrections(path: Path) -> None:
+    """One correction of every kind."""
+    first, second, *_ = read_tracks(path).names
+    who: dict[str, Any] = {"by": "Ann", "camera": "front"}
+    times = [datetime(2026, 1, 1, 0, minute, tzinfo=UTC) for minute in range(5)]
+    dot = path_text(np.array([2, 3]), np.full((2, 2), 40.0), np.full((2, 2), 0.1))
+    entries = (
+        Swap(**who, at=times[0], tracks="e" * 64, markers=(first, second), first=3),
+        Swap(**who, at=times[1], markers=(first, second), first=3),
+        Place(**who, at=times[2], marker="new", new=True, how="hand", path=dot),
+        Delete(**who, at=times[3], marker="new", first=2, last=3),
+        Accept(**who, at=times[4], marker=second, first=1, last=2),
+    )
+    write_corrections(corrections_path(path), entries)
 
 
 def _tracks(names: tuple[str, ...], position: np.ndarray) -> Tracks:

@@ -69,6 +69,7 @@ TARGETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "specimen": ("small.yaml", (*CAPTURE, "tracks", *OUT)),
     "recordings": ("recordings.csv", (*CAPTURE, "tracks", *OUT)),
     "tracks": ("tracks/take1.h5", (*CAPTURE, "tracks", *OUT)),
+    "corrections": ("tracks/take1.corrections.yaml", (*CAPTURE, "tracks", *OUT)),
     "csv": ("csv/take1.csv", (*CAPTURE, "csv", *OUT)),
     "c3d": ("c3d/take1.c3d", (*CAPTURE, "c3d", *OUT)),
     "trc": ("trc/take1.trc", (*CAPTURE, "trc", *OUT)),

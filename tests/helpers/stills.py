@@ -5,13 +5,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 
+from rafl.calibration.camera import OrthographicCamera, Plane
+from rafl.calibration.rig import Rig, rig_text
 from rafl.capture.description.specimen_text import body_of_box
 from rafl.capture.registration.recording import Recording
 from rafl.capture.specimen.specimen import Body, Specimen, build_specimen
 from rafl.data.markers import embed
 from rafl.data.synthetic import with_material
 from rafl.tracking.linking.layout import MarkerLayout
+from rafl.tracking.reconstruction.tracks import Tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
 
 SIZE_MM = (100.0, 20.0, 20.0)
 FRAMES = 12
@@ -54,3 +59,46 @@ def still(places_mm: np.ndarray, stiffness: float = 1.0, lying: bool = False) ->
     noise = np.random.default_rng(1).normal(0.0, 1e-5, (FRAMES, *position.shape))
     time = np.arange(FRAMES) / 100.0
     return Recording(names, time, position + noise, np.repeat(sigma[None], FRAMES, axis=0), None, True, "still.h5")
+
+
+LEFT, RIGHT = (
+    OrthographicCamera(
+        image_size=(640, 240),
+        scale=(5000.0, 5000.0),
+        rotation_vector=tuple(Rotation.from_matrix(axes).as_rotvec().tolist()),
+        offset=(320.0 - 5000.0 * 0.05 * axes[0][0], 100.0),
+        plane=Plane((0.0, axes[2][1], 0.0), axes[2][1] * y, 5e-4),
+    )
+    for axes, y in (([[1, 0, 0], [0, 0, -1], [0, 1, 0]], 0.0), ([[-1, 0, 0], [0, 0, -1], [0, -1, 0]], 0.02))
+)
+STILL_RIG = Rig({"left": LEFT, "right": RIGHT})
+
+
+def still_tracks(places_mm: np.ndarray = SIDES) -> Tracks:
+    """The tracks of the sagging box, of which a camera sees the left and another one the right side."""
+    recording = still(places_mm)
+    pixels = {}
+    for name, y in (("left", 0.0), ("right", SIZE_MM[1])):
+        seen = (places_mm[:, 1] == y)[:, None]
+        path = np.where(seen, STILL_RIG.cameras[name].project(recording.position), np.nan)
+        pixels[name] = CameraPixels(path, np.where(seen, 0.02, np.full_like(path, np.nan)))
+    position, sigma, residual = triangulate(STILL_RIG, pixels)
+    assert recording.names is not None
+    return Tracks(
+        names=recording.names, time=recording.time, position=position, sigma=sigma,
+        state=np.isfinite(position[..., 0]).astype(np.uint8),
+        pixel={camera: item.pixel for camera, item in pixels.items()}, residual=residual,
+        pixel_sigma={camera: item.sigma for camera, item in pixels.items()},
+        damaged={camera: np.zeros(FRAMES, bool) for camera in pixels},
+        frame={camera: np.arange(FRAMES) for camera in pixels}, images={camera: {} for camera in pixels}, fps=100.0,
+        calibration=rig_text(STILL_RIG), sources={}, settings="", longest_gap=5,
+    )  # fmt: skip
+
+
+def corner_pixels(camera: str) -> np.ndarray:
+    """Pixels of the corners of the side that a camera films, as the box sags: at the clamp, then at the tip, (4, 2)."""
+    vertices, q = _specimen().mesh.vertices, _sagging(1.0)
+    y = 0.0 if camera == "left" else 1e-3 * SIZE_MM[1]
+    ends = [(x, y, z) for x in (0.0, 1e-3 * SIZE_MM[0]) for z in (1e-3 * SIZE_MM[2], 0.0)]
+    nodes = [int(np.linalg.norm(vertices - end, axis=1).argmin()) for end in ends]
+    return np.asarray(STILL_RIG.cameras[camera].project(q[nodes]))

@@ -13,15 +13,17 @@ from pathlib import Path
 import pytest
 import uvicorn
 from filmed import Film, make_film, with_swapped
+from playwright.sync_api import Browser, Page, sync_playwright
 from served import Served
 from starlette.testclient import TestClient
 
-from rafl.review.server import create_server
+from rafl.review.server import View, create_server
 from rafl.review.tracks.calls import TracksView
 from rafl.review.tracks.recordings import Library
 from rafl.tracking.reconstruction.tracks import write_tracks
 
 PORT, TOKEN = 4321, "token-of-the-tests"
+OPTIONS = "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync"
 
 
 @pytest.fixture(scope="session")
@@ -52,15 +54,42 @@ def client(film: Film) -> Iterator[TestClient]:
         yield found
 
 
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    executable = shutil.which("chromium") or shutil.which("chromium-browser")
+    if executable is None:
+        pytest.skip("no chromium is installed: apt-get install chromium")
+    with sync_playwright() as playwright:
+        found = playwright.chromium.launch(executable_path=executable, args=[*OPTIONS.split(), "--no-first-run"])
+        yield found
+        found.close()
+
+
 @pytest.fixture
-def serve() -> Iterator[Callable[[Path], str]]:
-    """Serve a folder of tracks in this process; returns the address."""
+def errors() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def page(browser: Browser, errors: list[str]) -> Iterator[Page]:
+    context = browser.new_context(viewport={"width": 1280, "height": 800})
+    found = context.new_page()
+    found.on("pageerror", lambda error: errors.append(str(error)))
+    found.on("dialog", lambda dialog: errors.append(f"dialog {dialog.message}"))
+    found.set_default_timeout(15_000)
+    yield found
+    context.close()
+
+
+@pytest.fixture
+def serve_view() -> Iterator[Callable[[View], str]]:
+    """Serve a view in this process; returns the address."""
     running: list[tuple[uvicorn.Server, threading.Thread]] = []
 
-    def start(folder: Path) -> str:
+    def start(view: View) -> str:
         listener = socket.create_server(("127.0.0.1", 0))
         port = listener.getsockname()[1]
-        app = create_server(TracksView(Library(folder, None, "Ann")), TOKEN, port)
+        app = create_server(view, TOKEN, port)
         server = uvicorn.Server(uvicorn.Config(app, log_level="error", timeout_graceful_shutdown=1))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]}, daemon=True)
         thread.start()
@@ -71,6 +100,12 @@ def serve() -> Iterator[Callable[[Path], str]]:
     for server, thread in running:
         server.should_exit = True
         thread.join(10)
+
+
+@pytest.fixture
+def serve(serve_view: Callable[[View], str]) -> Callable[[Path], str]:
+    """Serve a folder of tracks in this process; returns the address."""
+    return lambda folder: serve_view(TracksView(Library(folder, None, "Ann")))
 
 
 @pytest.fixture

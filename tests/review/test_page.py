@@ -2,14 +2,13 @@
 
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-import pytest
 import torch
 from filmed import BIT_TOP, BIT_WIDTH, BITS, Film
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page
 from served import Served
 
 import rafl
@@ -20,10 +19,6 @@ from rafl.capture.specimen.specimen import Specimen
 from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
-
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-OPTIONS = "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync"
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no chromium is installed: apt-get install chromium")
 
 Serve = Callable[[Path], str]
 Launch = Callable[[Path], Served]
@@ -39,30 +34,6 @@ READ_COUNTER = f"""(camera) => {{
   }}
   return number;
 }}"""
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Browser]:
-    with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=[*OPTIONS.split(), "--no-first-run"])
-        yield found
-        found.close()
-
-
-@pytest.fixture
-def errors() -> list[str]:
-    return []
-
-
-@pytest.fixture
-def page(browser: Browser, errors: list[str]) -> Iterator[Page]:
-    context = browser.new_context(viewport={"width": 1280, "height": 800})
-    found = context.new_page()
-    found.on("pageerror", lambda error: errors.append(str(error)))
-    found.on("dialog", lambda dialog: errors.append(f"dialog {dialog.message}"))
-    found.set_default_timeout(15_000)
-    yield found
-    context.close()
 
 
 def open_recording(page: Page, address: str, name: str = "swing") -> None:
@@ -133,6 +104,8 @@ def test_every_correction_by_mouse_and_keyboard(film: Film, serve: Serve, page: 
     page.mouse.move(x + 9, y + 2, steps=3)
     page.mouse.up()
     wait_for_correction(page, "C3 fitted in frame 10")
+    assert page.get_attribute("body", "data-selected") == "C3"  # what is dragged is selected
+    assert page.locator("#plotted").inner_text() == "C3 in camera left, over the rows of the tracks"
     found = read_corrected_tracks(film.path).tracks
     np.testing.assert_allclose(found.pixel["left"][10, 12], film.tracks.pixel["left"][10, 12], atol=0.05)
     page.mouse.move(x, y)
@@ -159,7 +132,7 @@ def test_every_correction_by_mouse_and_keyboard(film: Film, serve: Serve, page: 
     page.keyboard.press("a")
     page.mouse.click(*position_of(page, "left", "C5"))
     page.wait_for_function("() => window.review.state.corrections.length === 5")
-    page.wait_for_function("() => !window.review.following && !document.body.dataset.acting")
+    page.wait_for_function("() => !window.review.corrector.following && !document.body.dataset.acting")
     found = read_corrected_tracks(film.path).tracks
     assert np.abs(found.pixel["left"][10:31, 14] - film.tracks.pixel["left"][10:31, 14]).max() < 0.2
     # A lost marker's cross is dragged onto the dot that comes back, and followed on.
@@ -176,12 +149,12 @@ def test_every_correction_by_mouse_and_keyboard(film: Film, serve: Serve, page: 
     page.mouse.move(x + 4, y + 4, steps=2)
     page.mouse.up()
     page.wait_for_function("() => window.review.state.corrections.length === 8")
-    page.wait_for_function("() => !window.review.following && !document.body.dataset.acting")
+    page.wait_for_function("() => !window.review.corrector.following && !document.body.dataset.acting")
     found = read_corrected_tracks(film.path).tracks
     assert np.abs(found.pixel["left"][10:31, 8] - film.tracks.pixel["left"][10:31, 8]).max() < 0.2
     # Rename, accept.
     click_marker(page, "left", "A2")
-    page.fill("#name", "Tip")
+    page.fill("#new-name", "Tip")
     page.get_by_role("button", name="Rename").click()
     wait_for_correction(page, "A2 is now Tip")
     page.get_by_role("button", name="Accept").click()
@@ -249,6 +222,58 @@ def test_second_page_is_told(film: Film, serve: Serve, page: Page, browser: Brow
     second.wait_for_selector("body[data-writable=true]")
     assert second.locator("#warning").is_hidden()
     second.close()
+
+
+def test_second_page_takes_over(film: Film, serve: Serve, page: Page, browser: Browser, errors: list[str]) -> None:
+    served = serve(film.path.parent)
+    open_recording(page, served)
+    page.wait_for_selector("body[data-writable=true]")
+    second = browser.new_page()
+    open_recording(second, served)
+    second.get_by_role("button", name="Correct it here").click()
+    second.get_by_role("button", name="Leave it").click()
+    assert second.get_attribute("body", "data-writable") == "false"
+    second.get_by_role("button", name="Correct it here").click()
+    second.locator("#taking button[value=yes]").click()
+    second.wait_for_selector("body[data-writable=true]")
+    page.wait_for_selector("body[data-writable=false]")
+    assert "Another page has taken over this recording" in page.locator("#warning").inner_text()
+    assert page.locator("button[data-do=swap]").is_disabled()
+    second.keyboard.press("n")
+    second.wait_for_selector("body[data-selected='A1,B1']")
+    second.keyboard.press("s")
+    page.wait_for_function("() => document.querySelectorAll('#corrections li').length === 1")
+    second.close()
+    assert errors == []
+
+
+def test_corrections_of_other_tracks_are_kept_or_taken_out(
+    film: Film, serve: Serve, page: Page, errors: list[str]
+) -> None:
+    served = serve(film.path.parent)
+    open_recording(page, served)
+    page.keyboard.press("n")
+    page.wait_for_selector("body[data-selected='A1,B1']")
+    page.keyboard.press("s")
+    wait_for_correction(page, "swapped from frame 40")
+    click_marker(page, "left", "C2")
+    page.keyboard.press("Enter")
+    wait_for_correction(page, "C2 accepted")
+    tracks = read_tracks(film.path)
+    tracks.pixel["left"][2, 3] += 0.5
+    write_tracks(film.path, tracks)
+    page.reload()
+    page.wait_for_selector("body[data-ready=recording]")
+    page.wait_for_selector("body[data-writable=true]")
+    assert "Some corrections were made on other tracks" in page.locator("#warning").inner_text()
+    page.get_by_role("button", name="It holds").last.click()
+    wait_for_correction(page, "holds for these tracks")
+    page.get_by_role("button", name="Take it out").click()
+    wait_for_correction(page, "is taken out")
+    assert page.locator("#corrections li").count() == 1
+    assert page.locator("#warning").is_hidden()
+    assert read_corrected_tracks(film.path).doubtful == ()
+    assert errors == []
 
 
 def test_hostile_names_do_nothing(film: Film, serve: Serve, page: Page, errors: list[str]) -> None:

@@ -362,7 +362,14 @@ def test_every_answer_forbids_foreign_scripts(client: TestClient) -> None:
     text = client.get("/").text
     assert "http:" not in text
     assert "https:" not in text
-    for script in ("api", *(f"tracks/{name}" for name in ("main", "view", "plots", "list", "panels", "recording"))):
+    for script in (
+        "api",
+        "frame",
+        *(
+            f"tracks/{name}"
+            for name in ("main", "view", "plots", "list", "panels", "recording", "corrector", "keyboard")
+        ),
+    ):
         answer = client.get(f"/static/{script}.js")
         assert answer.status_code == 200
         code = answer.text

@@ -1,14 +1,15 @@
 """Tracks with corrections: pixels are changed camera by camera, and what depends on them is computed anew."""
 
+import hashlib
 from dataclasses import dataclass, replace
-from functools import singledispatchmethod
+from functools import lru_cache, singledispatchmethod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rafl.calibration.rig import parse_calibration
+from rafl.calibration.rig import Rig, parse_calibration
 from rafl.common.errors import InputError
 from rafl.tracking.reconstruction.corrections import (
     Accept,
@@ -40,6 +41,9 @@ class CorrectedTracks:
         accepted: whether somebody has accepted the marker as it is there, (T, M).
         emptied: where a filled gap was deleted, (T, M).
         unfit: a line for each correction that does not fit the tracks and was left out.
+        doubtful: a line for each correction that was applied, but made on other tracks, in which the markers may have
+            had other dots. Positions that a person set or fitted name frame and pixel, so they hold for any tracks.
+        digest: of the tracks as tracked.
     """
 
     tracks: Tracks
@@ -48,6 +52,8 @@ class CorrectedTracks:
     accepted: NDArray[np.bool_]
     emptied: NDArray[np.bool_]
     unfit: tuple[str, ...]
+    doubtful: tuple[str, ...]
+    digest: str
 
 
 def read_corrected_tracks(path: str | Path) -> CorrectedTracks:
@@ -73,7 +79,11 @@ def with_corrections(tracks: Tracks, path: Path) -> CorrectedTracks:
     if not found.corrections:
         return found
     applied = len(found.corrections) - len(found.unfit)
-    notes = (f"{applied} correction{'' if applied == 1 else 's'} of {beside.name} applied", *found.unfit)
+    notes = (
+        f"{applied} correction{'' if applied == 1 else 's'} of {beside.name} applied",
+        *found.unfit,
+        *found.doubtful,
+    )
     return replace(found, tracks=replace(found.tracks, notes=(*tracks.notes, *notes)))
 
 
@@ -95,12 +105,19 @@ def apply_corrections(
         InputError: the tracks hold no calibration.
     """
     work = _Work(tracks)
-    unfit = []
+    unfit, doubtful = [], []
+    own = before.digest if before is not None else tracks_digest(tracks)
     for number, correction in enumerate(corrections, start=1):
         try:
             work.apply(correction)
         except _UnfitError as error:
-            unfit.append(f"correction {number} ({correction.kind}, by {correction.by}) is left out: {error}")
+            unfit.append(f"{left_out(number, correction)}{error}")
+            continue
+        if is_doubtful(correction, own):
+            doubtful.append(
+                f"correction {number} ({correction.kind}, by {correction.by}) was made on other tracks: look in "
+                "rafl-review whether it still holds"
+            )
     result, differs = work.tracks, work.changed
     if before is not None and len(before.tracks.names) == len(result.names):
         known = before.tracks
@@ -118,7 +135,31 @@ def apply_corrections(
             sigma=result.sigma + nowhere,
             state=np.where(emptied, np.uint8(MISSING), result.state),
         )
-    return CorrectedTracks(result, corrections, work.changed, work.accepted, work.emptied, tuple(unfit))
+    changes = work.changed, work.accepted, work.emptied
+    return CorrectedTracks(result, corrections, *changes, tuple(unfit), tuple(doubtful), own)
+
+
+def tracks_digest(tracks: Tracks) -> str:
+    """SHA-256 of the names and of the cameras' frames and pixels, which corrections change; for tracks as tracked.
+
+    Another calibration leaves it as it is.
+    """
+    digest = hashlib.sha256("\n".join(tracks.names).encode())
+    for camera in sorted(tracks.pixel):
+        digest.update(camera.encode())
+        for values in (tracks.frame[camera].astype("<i8"), tracks.pixel[camera].astype("<f8")):
+            digest.update(np.ascontiguousarray(values).data)
+    return digest.hexdigest()
+
+
+def is_doubtful(correction: Correction, digest: str) -> bool:
+    """Whether a correction was made on other tracks than those of a digest, and may not hold for them."""
+    return correction.tracks not in ("", digest) and not isinstance(correction, Place)
+
+
+def left_out(number: int, correction: Correction) -> str:
+    """How the line about a correction that was left out begins; the reason follows."""
+    return f"correction {number} ({correction.kind}, by {correction.by}) is left out: "
 
 
 def _differing(work: "_Work", before: CorrectedTracks) -> NDArray[np.bool_]:
@@ -137,12 +178,11 @@ class _UnfitError(Exception):
 
 
 class _Work:
-    """Tracks whose pixels are being corrected; arrays are copied before they are changed."""
+    """Tracks whose pixels are being corrected; the arrays of a camera are copied before they are changed first."""
 
     def __init__(self, tracks: Tracks) -> None:
-        pixel = {camera: values.copy() for camera, values in tracks.pixel.items()}
-        sigma = {camera: values.copy() for camera, values in tracks.pixel_sigma.items()}
-        self.tracks = replace(tracks, pixel=pixel, pixel_sigma=sigma)
+        self.tracks = replace(tracks, pixel=dict(tracks.pixel), pixel_sigma=dict(tracks.pixel_sigma))
+        self.copied: set[str] = set()  # cameras
         self.changed = np.zeros(tracks.state.shape, bool)
         self.accepted = np.zeros(tracks.state.shape, bool)
         self.emptied = np.zeros(tracks.state.shape, bool)  # where no gap is filled
@@ -170,8 +210,9 @@ class _Work:
         column = self._column(correction.marker)
         rows = first_rows[there]
         pixel, sigma = self._at_row_times(camera, column, rows, values[:, 1:3], values[:, 3:])
-        self.tracks.pixel[camera][rows, column] = pixel
-        self.tracks.pixel_sigma[camera][rows, column] = sigma
+        paths, sigmas = self._changeable(camera)
+        paths[rows, column] = pixel
+        sigmas[rows, column] = sigma
         self.changed[rows, column] = True
 
     @apply.register
@@ -182,8 +223,8 @@ class _Work:
         if not (rows & seen).any():  # what is deleted is a filled gap
             self.emptied[rows, column] = True
         rows &= seen
-        self.tracks.pixel[camera][rows, column] = np.nan
-        self.tracks.pixel_sigma[camera][rows, column] = np.nan
+        for values in self._changeable(camera):
+            values[rows, column] = np.nan
         self.changed[rows, column] = True
 
     @apply.register
@@ -199,8 +240,9 @@ class _Work:
         if frame.max() < correction.first:
             raise _UnfitError(f"camera {camera} has frames up to {frame.max()}, not {correction.first}")
         rows = np.arange(len(frame)) >= int(np.argmax(frame >= correction.first))
-        for values in (self.tracks.pixel[camera], self.tracks.pixel_sigma[camera]):
-            values[np.ix_(rows, pair)] = values[np.ix_(rows, pair[::-1])]
+        first = int(np.argmax(rows))
+        for values in self._changeable(camera):
+            values[first:, pair] = values[first:, pair[::-1]]
         seen = np.isfinite(self.tracks.pixel_sigma[camera][:, pair, 0]).any(axis=1)
         self.changed[np.ix_(rows & seen, pair)] = True
 
@@ -220,6 +262,14 @@ class _Work:
         if camera not in self.tracks.pixel:
             raise _UnfitError(f"the tracks have no camera {camera}")
         return camera
+
+    def _changeable(self, camera: str) -> tuple[Array, Array]:
+        """Pixels and sigmas of a camera that may be changed, (T, M, 2)."""
+        pixel, sigma = self.tracks.pixel, self.tracks.pixel_sigma
+        if camera not in self.copied:
+            self.copied.add(camera)
+            pixel[camera], sigma[camera] = pixel[camera].copy(), sigma[camera].copy()
+        return pixel[camera], sigma[camera]
 
     def _column(self, marker: str) -> int:
         if marker not in self.tracks.names:
@@ -283,7 +333,7 @@ class _Work:
 
 def _reconstruct(tracks: Tracks, changed: NDArray[np.bool_], source: Path) -> Tracks:
     """The tracks, with positions triangulated from the pixels where `changed`, (T, M)."""
-    rig = parse_calibration(tracks.calibration, source)
+    rig = _rig(tracks.calibration, source)
     rows, columns = np.nonzero(changed)
     pixels = {
         camera: CameraPixels(tracks.pixel[camera][rows, columns][None], tracks.pixel_sigma[camera][rows, columns][None])
@@ -301,6 +351,11 @@ def _reconstruct(tracks: Tracks, changed: NDArray[np.bool_], source: Path) -> Tr
         position, sigma, state, tracks.time, _longest_filled(tracks.state) if longest is None else longest, changed
     )
     return replace(tracks, position=position, sigma=sigma, state=state, residual=residual)
+
+
+@lru_cache(maxsize=8)
+def _rig(calibration: str, source: Path) -> Rig:
+    return parse_calibration(calibration, source)
 
 
 def _longest_filled(state: NDArray[np.uint8]) -> int:

@@ -1,7 +1,7 @@
 """`<recording>.corrections.yaml`: what a person corrected in tracks. The tracks file itself stays as tracked."""
 
 from datetime import datetime
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -28,7 +28,10 @@ def _check_path(text: str) -> str:
     rows = [line.split() for line in text.splitlines()]
     if not rows or any(len(row) != 5 for row in rows):
         raise ValueError("expected lines of frame, x, y, sigma of x, sigma of y")
-    numbers = np.array(rows, dtype=float)
+    try:
+        numbers = np.array(rows, dtype=float)
+    except ValueError:
+        raise ValueError("expected lines of five numbers, found other text") from None
     if not (np.isfinite(numbers).all() and np.abs(numbers).max() < LARGEST and (numbers[:, 3:] > 0.0).all()):
         raise ValueError("expected finite positions and positive sigmas")
     frames = numbers[:, 0]
@@ -44,11 +47,13 @@ class _Correction(StrictModel):
         by: name of the person.
         at: date and time.
         camera: whose frames the frame numbers count.
+        tracks: digest of the tracks on which it was made (`tracks_digest`); empty in files of earlier programs.
     """
 
     by: Annotated[str, AfterValidator(check_visible)]
     at: AwareDatetime
     camera: Name
+    tracks: Annotated[str, Field(pattern="^([0-9a-f]{64})?$")] = ""
 
 
 class _Stretch(_Correction):
@@ -81,10 +86,10 @@ class Place(_Correction):
     how: Literal["fit", "hand", "followed"]
     path: Annotated[str, AfterValidator(_check_path)]
 
-    @cached_property
+    @property
     def positions(self) -> Array:
         """`path` as numbers, (F, 5)."""
-        return np.array([line.split() for line in self.path.splitlines()], dtype=float)
+        return _path_numbers(self.path)
 
 
 class Delete(_Stretch):
@@ -127,6 +132,14 @@ Correction = Place | Delete | Accept | Swap | Rename
 class _CorrectionsFile(StrictModel):
     format: str
     corrections: list[Annotated[Correction, Field(discriminator="kind")]]
+
+
+@lru_cache(maxsize=4096)
+def _path_numbers(path: str) -> Array:
+    """Numbers of a path, kept beside the corrections: an array among their fields would make them incomparable."""
+    numbers = np.array([line.split() for line in path.splitlines()], dtype=float)
+    numbers.setflags(write=False)
+    return numbers
 
 
 def path_text(frames: Array, pixel: Array, sigma: Array) -> str:

@@ -91,12 +91,14 @@ def refill_gaps(
         return position, sigma, state
     known = np.where(measured[..., None], position, np.nan)
     filled, grown, new = fill_gaps(known, sigma, time, longest, anew)
-    kept = ~(anew | measured)[..., None]
-    return (
-        np.where(kept, position, filled),
-        np.where(kept, sigma, np.where((new > 0)[..., None], grown, np.nan)),
-        np.where(kept[..., 0], state, new),
-    )
+    own = np.flatnonzero(anew.any(axis=0))  # markers with such gaps; copying all arrays anew takes longer than filling
+    position, sigma, state = position.copy(), sigma.copy(), state.copy()
+    taken = (anew | measured)[:, own]
+    found = (new[:, own] > 0)[..., None]
+    position[:, own] = np.where(taken[..., None], filled[:, own], position[:, own])
+    sigma[:, own] = np.where(taken[..., None], np.where(found, grown[:, own], np.nan), sigma[:, own])
+    state[:, own] = np.where(taken, new[:, own], state[:, own])
+    return position, sigma, state
 
 
 def _split_by_seen(gap: NDArray[np.int64], seen: NDArray[np.bool_]) -> list[NDArray[np.int64]]:

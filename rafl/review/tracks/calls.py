@@ -1,54 +1,59 @@
 """The calls of the page of tracks, each of which reads or corrects one recording."""
 
+from pathlib import Path
 from typing import Annotated
 
 from fastapi import Body, FastAPI, Response
 from fastapi.responses import JSONResponse
 
-from rafl.calibration.rig import Rig, parse_calibration
 from rafl.common.errors import InputError
+from rafl.review.specimen.calls import ShownTracks, add_specimen_calls
 from rafl.review.tracks.blocks import block, series
 from rafl.review.tracks.edits import Action, perform
 from rafl.review.tracks.recording import OpenRecording
 from rafl.review.tracks.recordings import Library
 from rafl.review.tracks.stretches import find_stretches
+from rafl.tracking.reconstruction.corrected_tracks import is_doubtful
 
 MAX_SUMMARIES = 50  # of one call
 NO_VIDEO = 404
 
 
 class TracksView:
-    """The view of a folder of tracks; see `View`."""
+    """The view of a folder of tracks; see `View`.
+
+    Args:
+        library: the folder.
+        specimens: folder to which specimens that are described on the page are written.
+    """
 
     page = "tracks/tracks.html"
 
-    def __init__(self, library: Library) -> None:
-        self.library = library
+    def __init__(self, library: Library, specimens: Path = Path()) -> None:
+        self.library, self.specimens = library, specimens
         self.title = f"{len(library.names())} recordings in {library.folder}"
 
     def add_calls(self, app: FastAPI) -> None:
         """Add the calls that read and those that correct."""
         _add_reading_calls(app, self.library)
         _add_correcting_calls(app, self.library)
+        add_specimen_calls(app, self._tracks_of, self.specimens)
+
+    def _tracks_of(self, name: str) -> ShownTracks:
+        recording = self.library.open(name)
+        return ShownTracks(recording.path, recording.found, recording.rig)
 
     def close(self) -> None:
         """Close all videos."""
         self.library.close()
 
 
-def _rig(recording: OpenRecording) -> Rig | None:
-    """The cameras with which a recording was tracked; None if the tracks do not hold them."""
-    try:
-        return parse_calibration(recording.raw.calibration, recording.path) if recording.raw.calibration else None
-    except InputError:
-        return None
-
-
 def _state(recording: OpenRecording) -> dict[str, object]:
     """What changes with a correction."""
     entries = [
-        entry.model_dump(mode="json", exclude={"path"})
+        entry.model_dump(mode="json", exclude={"path", "tracks"})
         | ({"frames": len(entry.positions)} if entry.kind == "place" else {})
+        | {"doubtful": is_doubtful(entry, recording.found.digest)}
         for entry in recording.corrections
     ]
     return {
@@ -56,6 +61,7 @@ def _state(recording: OpenRecording) -> dict[str, object]:
         "names": recording.tracks.names,
         "corrections": entries,
         "unfit": recording.found.unfit,
+        "doubtful": recording.found.doubtful,
         "redo": len(recording.undone),
     }
 
@@ -82,7 +88,7 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
     @app.get("/api/recording")
     def recording(name: str) -> dict[str, object]:
         found = library.open(name, anew=True)
-        rig = _rig(found)
+        rig = found.rig
         tracks = found.raw
         return _state(found) | {
             "name": name,
@@ -95,12 +101,13 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
                 for camera in tracks.pixel
             ],
             "corrections_file": found.beside.name,
+            "locked": found.locked,
         }
 
     @app.get("/api/block")
     def rows(name: str, first: int, count: int) -> Response:
         found = library.open(name)
-        return Response(block(found, _rig(found), first, count), media_type="application/octet-stream")
+        return Response(block(found, found.rig, first, count), media_type="application/octet-stream")
 
     @app.get("/api/series")
     def values(name: str, marker: int, camera: str) -> Response:
@@ -113,7 +120,11 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
     @app.get("/api/frame")
     def frame(name: str, camera: str, number: int) -> Response:
         try:
-            content = library.open(name).frames(camera).jpeg(number)
+            recording = library.open(name)
+            store = recording.frames(camera)
+            if number not in recording.raw.frame[camera]:
+                return JSONResponse({"error": f"the tracks have no frame {number} of camera {camera}"}, NO_VIDEO)
+            content = store.jpeg(number)
         except InputError as error:
             return JSONResponse({"error": str(error)}, NO_VIDEO)
         if content is None:
@@ -123,8 +134,10 @@ def _add_reading_calls(app: FastAPI, library: Library) -> None:
 
 def _add_correcting_calls(app: FastAPI, library: Library) -> None:
     @app.post("/api/claim")
-    def claim(name: str, page: str) -> dict[str, object]:
+    def claim(name: str, page: str, take: bool = False) -> dict[str, object]:
         found = library.open(name)
+        if take:
+            found.take_over(page)
         return {"writable": found.claim_for(page), "revision": found.revision}
 
     @app.post("/api/release")

@@ -18,6 +18,7 @@ Array = NDArray[Any]
 FOLLOWED_ROWS = 25  # by one request; the page asks again until the dot is lost
 # Sigma of fits in frames that an encoder predicted from others is at least the usual one of the recording's markers,
 # which contains the errors of compression.
+MARGIN_SHARE = 0.05  # of the longer side of an image: how far outside a position may be set by hand
 DEFAULT_SIGMA_PX = 0.05  # where no marker is seen at all
 
 
@@ -37,6 +38,7 @@ class Action(BaseModel):
         sigma: of a position set by hand [px].
         new: whether the marker is one that the tracker did not find.
         all_cameras: whether the marker is deleted in all cameras.
+        entry: index of a correction that was made on other tracks.
     """
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
@@ -53,6 +55,7 @@ class Action(BaseModel):
     sigma: float = Field(1.0, gt=0.0, le=1000.0)
     new: bool = False
     all_cameras: bool = False
+    entry: int = Field(0, ge=0)
 
 
 def perform(recording: OpenRecording, page: str, action: Action) -> dict[str, object]:
@@ -78,7 +81,12 @@ def perform(recording: OpenRecording, page: str, action: Action) -> dict[str, ob
 
 
 def _signature(recording: OpenRecording, camera: str) -> dict[str, Any]:
-    return {"by": recording.who, "at": recording.next_moment(), "camera": camera}
+    return {
+        "by": recording.who,
+        "at": recording.next_moment(),
+        "camera": camera,
+        "tracks": recording.found.digest,
+    }
 
 
 def _frame(recording: OpenRecording, camera: str, row: int) -> int:
@@ -123,7 +131,9 @@ def _place(recording: OpenRecording, action: Action) -> dict[str, object]:
     frame = _frame(recording, action.camera, action.row)
     position, sigma = np.array([action.x, action.y]), np.full(2, action.sigma)
     message = f"{action.marker} set by hand in frame {frame}"
-    if not action.hand:
+    if action.hand:
+        _check_inside(recording, action)
+    else:
         dot = _dot(recording, action.camera, action.row, position, action.marker)
         position, sigma = dot.centre, np.maximum(dot.sigma, _least_sigma(recording, action.camera))
         message = f"{action.marker} fitted in frame {frame}"
@@ -139,6 +149,19 @@ def _place(recording: OpenRecording, action: Action) -> dict[str, object]:
     )
     recording.add((entry,))
     return {"message": message}
+
+
+def _check_inside(recording: OpenRecording, action: Action) -> None:
+    """Refuse a position that is farther outside the image than a dot that is cut off by its border."""
+    rig = recording.rig
+    if rig is None or action.camera not in rig.cameras:
+        return
+    size = np.array(rig.cameras[action.camera].image_size)
+    margin, position = MARGIN_SHARE * size.max(), np.array([action.x, action.y])
+    if not ((position >= -margin) & (position <= size + margin)).all():
+        raise InputError(
+            f"expected a position in the image of {size[0]} x {size[1]} px, found ({action.x:.0f}, {action.y:.0f})"
+        )
 
 
 def _taken_by(recording: OpenRecording, action: Action, dot: PointedDot) -> str:
@@ -224,6 +247,16 @@ def _redo(recording: OpenRecording, action: Action) -> dict[str, object]:
     return {"message": "made again" if recording.redo() else "nothing to make again"}
 
 
+def _keep(recording: OpenRecording, action: Action) -> dict[str, object]:
+    recording.keep(action.entry)
+    return {"message": "the correction holds for these tracks"}
+
+
+def _drop(recording: OpenRecording, action: Action) -> dict[str, object]:
+    recording.drop(action.entry)
+    return {"message": "the correction is taken out"}
+
+
 _ACTIONS: dict[str, Callable[[OpenRecording, Action], dict[str, object]]] = {
     "place": _place,
     "follow": _follow,
@@ -233,4 +266,6 @@ _ACTIONS: dict[str, Callable[[OpenRecording, Action], dict[str, object]]] = {
     "rename": _rename,
     "undo": _undo,
     "redo": _redo,
+    "keep": _keep,
+    "drop": _drop,
 }

@@ -4,16 +4,19 @@ import threading
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.calibration.rig import Rig, parse_calibration
 from rafl.common.errors import InputError
+from rafl.common.files import require_writable
 from rafl.review.server import ReadOnlyError
 from rafl.review.tracks.frames import FrameStore
-from rafl.tracking.reconstruction.corrected_tracks import apply_corrections
+from rafl.tracking.reconstruction.corrected_tracks import apply_corrections, is_doubtful, left_out
 from rafl.tracking.reconstruction.corrections import (
     Correction,
     corrections_path,
@@ -56,6 +59,16 @@ class OpenRecording:
         self.stores: dict[str, FrameStore] = {}
         self.opening = threading.Lock()
         self.claim: tuple[str, float] = ("", -np.inf)
+        self.used = time.monotonic()
+        self.locked = _reason_to_lock(self.beside)
+
+    @cached_property
+    def rig(self) -> Rig | None:
+        """The cameras with which it was tracked; None if the tracks do not hold them."""
+        try:
+            return parse_calibration(self.raw.calibration, self.path) if self.raw.calibration else None
+        except InputError:
+            return None
 
     @property
     def tracks(self) -> Tracks:
@@ -96,6 +109,11 @@ class OpenRecording:
                 self.claim = (page, time.monotonic())
             return self.claim[0] == page
 
+    def take_over(self, page: str) -> None:
+        """A page corrects the recording from now on, whichever did before."""
+        with self.editing:
+            self.claim = (page, time.monotonic())
+
     def release(self, page: str) -> None:
         """A page leaves."""
         with self.editing:
@@ -105,7 +123,9 @@ class OpenRecording:
     def require_claim(self, page: str) -> None:
         """Raise `ReadOnlyError` unless a page may correct the recording."""
         if not self.claim_for(page):
-            raise ReadOnlyError("another page has this recording open; close it there to correct it here")
+            raise ReadOnlyError(
+                "another page has this recording open; close it there, or take it over, to correct it here"
+            )
 
     def next_moment(self) -> datetime:
         """The time of a new correction, later than all others: corrections of one time are undone together."""
@@ -126,6 +146,31 @@ class OpenRecording:
     def replace_last(self, entry: Correction) -> None:
         """Replace the last correction by one that goes on from it."""
         self._replace((*self.corrections[:-1], entry), 1)
+
+    def keep(self, number: int) -> None:
+        """A correction that was made on other tracks holds for these.
+
+        Raises:
+            InputError: there is no such correction.
+        """
+        entry = self._doubtful(number).model_copy(update={"tracks": self.found.digest})
+        self._replace((*self.corrections[:number], entry, *self.corrections[number + 1 :]), 0)
+        self.undone.clear()
+
+    def drop(self, number: int) -> None:
+        """A correction that was made on other tracks does not hold for these: it is taken out.
+
+        Raises:
+            InputError: there is no such correction.
+        """
+        self._doubtful(number)
+        self._replace((*self.corrections[:number], *self.corrections[number + 1 :]), 0)
+        self.undone.clear()
+
+    def _doubtful(self, number: int) -> Correction:
+        if not (0 <= number < len(self.corrections) and is_doubtful(self.corrections[number], self.found.digest)):
+            raise InputError("expected a correction that was made on other tracks, found none; load the page again")
+        return self.corrections[number]
 
     def undo(self) -> bool:
         """Take back the last correction, and those made together with it; False if there is none."""
@@ -154,10 +199,21 @@ class OpenRecording:
         if self.is_changed():
             raise InputError(f"{self.path.stem} was tracked or corrected by another program; load the page again")
         found = apply_corrections(self.raw, corrections, self.path, self.found)
-        rejected = [line for line in found.unfit if line not in self.found.unfit]
-        if new and rejected:
-            raise InputError(rejected[-1].partition(": ")[2])
+        for number in range(len(corrections), len(corrections) - new, -1):
+            begin = left_out(number, corrections[number - 1])
+            for line in found.unfit:
+                if line.startswith(begin):
+                    raise InputError(line.removeprefix(begin))
         write_corrections(self.beside, corrections)
         self.text = corrections_text(corrections).encode()
         self.corrections, self.found = corrections, found
         self.revision += 1
+
+
+def _reason_to_lock(path: Path) -> str:
+    """Why no corrections can be written to a file; empty if they can."""
+    try:
+        require_writable(path)
+    except InputError as error:
+        return str(error)
+    return ""

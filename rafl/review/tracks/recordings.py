@@ -1,6 +1,7 @@
 """The recordings of a folder of tracks: their names, summaries and videos."""
 
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +14,7 @@ from rafl.common.errors import InputError
 from rafl.common.files import sha256
 from rafl.common.hdf5_files import read_hdf5
 from rafl.common.names import check_name
-from rafl.review.tracks.recording import OpenRecording
+from rafl.review.tracks.recording import CLAIM_S, OpenRecording
 from rafl.tracking.reconstruction.corrections import corrections_path
 from rafl.tracking.reconstruction.gap_filling import FILLED, MEASURED, MISSING
 from rafl.tracking.reconstruction.tracks import LABEL, Tracks
@@ -21,7 +22,8 @@ from rafl.tracking.video.reader import Video, is_video, open_video
 
 Result = TypeVar("Result")
 
-MAX_OPEN = 3  # recordings whose tracks and frames are kept in memory
+# Recordings whose tracks and frames are kept in memory: those that no page uses, and all.
+MAX_UNUSED, MAX_OPEN = 3, 8
 
 
 class Library:
@@ -96,15 +98,21 @@ class Library:
         with self.opening:
             known = self.opened.get(name)
             if known is not None and not (anew and known.is_changed()):
+                known.used = time.monotonic()
                 self.opened.move_to_end(name)
                 return known
             if known is not None:
                 self.opened.pop(name).close()
             found = self._read(lambda: OpenRecording(path, self.who, self._find_video))
             self.opened[name] = found
-            while len(self.opened) > MAX_OPEN:
+            while len(self.opened) > MAX_OPEN or self._is_oldest_unused():
                 self.opened.popitem(last=False)[1].close()
             return found
+
+    def _is_oldest_unused(self) -> bool:
+        """Whether there are many recordings, of which no page has asked for the oldest one lately."""
+        oldest = next(iter(self.opened.values()))
+        return len(self.opened) > MAX_UNUSED and time.monotonic() - oldest.used > CLAIM_S
 
     def close(self) -> None:
         """Close all videos."""

@@ -19,6 +19,7 @@ from rafl.evaluation.page_data import pack_motion
 from rafl.evaluation.page_file import static_text
 from rafl.fem.mesh import HexMesh
 from rafl.review.commands import open_view
+from rafl.review.kinds import TRACKS, check_options
 from rafl.review.results.calls import ResultsView
 from rafl.review.server import create_server
 from rafl.review.tracks.calls import TracksView
@@ -98,12 +99,12 @@ def test_what_cannot_be_shown_is_refused(run_folder: Path, tmp_path: Path) -> No
     for name, message in (
         ("fitted", r"rafl-eval .*fitted DATASET\.h5"),
         ("empty", r"expected tracks .* or an evaluated model"),
-        ("other.h5", r"expected format rafl-dataset/1 .* found 'rafl-evaluation/1'"),
+        ("other.h5", r"expected format rafl-dataset/2 .* found 'rafl-evaluation/1'"),
     ):
         with pytest.raises(InputError, match=message):
             open_view(tmp_path / name, None, "Ann")
     with pytest.raises(InputError, match="--videos: expected a folder of tracks"):
-        open_view(run_folder, tmp_path, "Ann")
+        check_options(run_folder, {"--videos": (tmp_path, TRACKS)})
     with (run_folder / "evaluation.h5").open("r+b") as file:
         file.truncate(3000)
     with pytest.raises(InputError, match=r"which cannot be read: .*run rafl-eval again"):

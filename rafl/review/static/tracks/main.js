@@ -1,28 +1,30 @@
-// Which view is shown: `#/` the list, `#/recording/<name>` one recording.
+// Which view is shown: `#/` the list, `#/recording/<name>` one recording, `#/specimen/<name>` the specimen that it shows.
 
 import { showList } from "/static/tracks/list.js";
 import { Recording } from "/static/tracks/recording.js";
+import { Specimen } from "/static/specimen/specimen.js";
+
+const VIEWS = { recording: Recording, specimen: Specimen };
 
 let open = null;
 
 async function route() {
   open?.close();
   open = null;
-  const match = location.hash.match(/^#\/recording\/(.+)$/);
-  document.querySelector("#list").hidden = Boolean(match);
-  document.querySelector("#recording").hidden = !match;
+  const [, kind, name] = location.hash.match(/^#\/(recording|specimen)\/(.+)$/) ?? [];
+  for (const id of ["list", "recording", "specimen"]) document.querySelector(`#${id}`).hidden = id !== (kind ?? "list");
   delete document.body.dataset.ready;
   try {
-    if (!match) await showList();
+    if (!kind) await showList();
     else {
-      open = window.review = new Recording(decodeURIComponent(match[1]));
+      open = window.review = new VIEWS[kind](decodeURIComponent(name));
       await open.start();
     }
   } catch (error) {
-    const warning = document.querySelector("#warning");
-    document.querySelector("#recording").hidden = false;
-    warning.hidden = false;
-    warning.textContent = error.message;
+    const place = kind === "specimen" ? "#specimen-warning" : "#warning";
+    if (!kind) document.querySelector("#recording").hidden = false;
+    document.querySelector(place).hidden = false;
+    document.querySelector(kind === "specimen" ? place : "#warning-text").textContent = error.message;
   }
 }
 

@@ -49,9 +49,25 @@ function described(entry) {
   return `${texts[entry.kind]()}, ${entry.camera} - ${entry.by}, ${entry.at.slice(0, 16).replace("T", " ")}`;
 }
 
-export function showCorrections({ corrections, corrections_file: file }) {
+// A correction that was made on other tracks is kept or taken out: call("keep" or "drop", its index).
+export function showCorrections({ corrections, corrections_file: file }, call) {
   $("#file").textContent = corrections.length ? `in ${file}, the last first:` : `none yet; they go to ${file}`;
-  $("#corrections").replaceChildren(...corrections.map((entry) => item(described(entry))).reverse());
+  const entries = corrections.map((entry, index) => {
+    const found = item(described(entry), entry.doubtful ? "doubtful" : "");
+    if (entry.doubtful) {
+      found.append(" - made on other tracks: ");
+      for (const [kind, text] of [
+        ["keep", "It holds"],
+        ["drop", "Take it out"],
+      ]) {
+        const button = Object.assign(document.createElement("button"), { textContent: text });
+        button.addEventListener("click", () => call(kind, index));
+        found.append(button, " ");
+      }
+    }
+    return found;
+  });
+  $("#corrections").replaceChildren(...entries.reverse());
 }
 
 export function showNotes(notes) {

@@ -10,11 +10,13 @@ const AXIS = {
   font: "11px system-ui",
   values: (_, ticks) => ticks.map((tick) => Number(tick.toPrecision(4))),
 };
+const LABEL = { labelSize: 16, labelGap: 0, labelFont: "11px system-ui" };
 const PLOTS = [
   {
     key: "path",
     share: 1.0,
-    label: "path",
+    left: "x, y, z [mm]",
+    right: "u, v [px]",
     series: [
       ["x [mm]", "#ff8f6b"],
       ["y [mm]", "#5aff7a"],
@@ -23,11 +25,12 @@ const PLOTS = [
       ["v [px]", "#ffe36b"],
     ],
   },
-  { key: "residual", share: 0.5, label: "residual", series: [["residual [px]", "#ff8f6b"]] },
+  { key: "residual", share: 0.5, left: "residual [px]", series: [["residual [px]", "#ff8f6b"]] },
   {
     key: "sigma",
     share: 0.5,
-    label: "sigma",
+    left: "sigma [px]",
+    right: "sigma [mm]",
     series: [
       ["sigma [px]", "#6bb8ff"],
       ["sigma [mm]", "#5aff7a"],
@@ -42,7 +45,7 @@ export class Plots {
   constructor(parent, rows, jump) {
     Object.assign(this, { parent, rows, jump, row: 0, state: null, plots: [] });
     this.x = Float64Array.from({ length: rows }, (_, row) => row);
-    for (const { key, series } of PLOTS) {
+    for (const { key, series, left, right } of PLOTS) {
       const options = {
         ...this.size(key),
         scales: {
@@ -52,11 +55,11 @@ export class Plots {
         legend: { live: false },
         cursor: { drag: { x: false, y: false }, sync: { key: "row" }, points: { size: 4 } },
         axes: [
-          { ...AXIS, size: 22, gap: 2 },
-          { ...AXIS, size: 52, space: 24 },
-          ...(key === "residual"
-            ? []
-            : [{ ...AXIS, size: 52, side: 1, space: 24, scale: "second", grid: { show: false } }]),
+          { ...AXIS, size: 20, gap: 2, label: "row", ...LABEL },
+          { ...AXIS, size: 48, space: 24, label: left, ...LABEL },
+          ...(right
+            ? [{ ...AXIS, size: 48, side: 1, space: 24, scale: "second", grid: { show: false }, label: right, ...LABEL }]
+            : []),
         ],
         series: [
           {},
@@ -94,12 +97,13 @@ export class Plots {
     };
   }
 
-  async load(name, marker, camera) {
+  async load(name, marker, camera, title) {
     const values = await getArray("series", { name, marker, camera });
     const column = (k) =>
       Array.from(values.subarray(k * this.rows, (k + 1) * this.rows), (v) => (Number.isFinite(v) ? v : null));
     const [x, y, z, sigmaMm, u, v, sigmaPx, residual, state] = Array.from({ length: 9 }, (_, k) => column(k));
     this.state = state;
+    document.querySelector("#plotted").textContent = title;
     [[x, y, z, u, v], [residual], [sigmaPx, sigmaMm]].forEach((data, k) => this.plots[k].setData([this.x, ...data]));
   }
 

@@ -1,9 +1,11 @@
 // One recording: frames with markers, plots, stretches to look at, and corrections.
 
-import { Images, Rows, get, leave, page, post } from "/static/api.js";
+import { Images, Rows, get, leave } from "/static/api.js";
+import { Corrector } from "/static/tracks/corrector.js";
+import { onKey } from "/static/tracks/keyboard.js";
 import { Plots } from "/static/tracks/plots.js";
 import { showCorrections, showNotes, showStretches } from "/static/tracks/panels.js";
-import { CameraView } from "/static/tracks/view.js";
+import { CameraView, ELLIPSES } from "/static/tracks/view.js";
 
 const CLAIM_MS = 1500;
 const PREFETCHED = 4; // frames ahead of the one shown
@@ -19,19 +21,20 @@ export class Recording {
       camera: "",
       stretches: [],
       current: -1,
-      writable: false,
-      adding: false,
       going: Promise.resolve(),
       stopped: false,
       wanted: 0,
-      busy: Promise.resolve(),
     });
+    this.corrector = new Corrector(this);
     this.listening = new AbortController();
   }
 
   async start() {
     $("#title").textContent = this.name;
+    $("#describe").href = `#/specimen/${encodeURIComponent(this.name)}`;
     $("#warning").hidden = true;
+    $("#take-over").hidden = true;
+    $("#ellipse").textContent = `${ELLIPSES[0]} sigma`;
     $("#message").textContent = "";
     document.title = `${this.name} - rafl-review`;
     // Nothing of another recording stays, also if this one cannot be read.
@@ -48,8 +51,8 @@ export class Recording {
     for (const button of document.querySelectorAll("[data-do]")) button.disabled = false;
     const calls = {
       select: (marker, more) => this.select(marker, more),
-      move: (camera, marker, x, y, hand) => this.move(camera, marker, x, y, hand),
-      click: (camera, x, y) => this.adding && (this.add(camera, x, y), true),
+      move: (camera, marker, x, y, hand) => this.corrector.move(camera, marker, x, y, hand),
+      click: (camera, x, y) => this.corrector.adding && (this.corrector.add(camera, x, y), true),
       activate: (camera) => this.activate(camera),
     };
     this.views = this.state.cameras.map(({ name, size }) => new CameraView($("#cameras"), name, size, calls));
@@ -57,8 +60,8 @@ export class Recording {
     this.plots = new Plots($("#plots"), this.state.rows, (row) => this.show(row));
     this.listen();
     this.showState();
-    await this.claim();
-    this.claiming = setInterval(() => this.claim(), CLAIM_MS);
+    await this.corrector.claim();
+    this.claiming = setInterval(() => this.corrector.claim(), CLAIM_MS);
     await Promise.all([this.show(0), this.loadStretches(), cameras.length ? this.plotMarker() : undefined]);
     document.body.dataset.ready = "recording";
   }
@@ -71,39 +74,28 @@ export class Recording {
     leave(this.name);
   }
 
-  async claim() {
-    try {
-      const { writable, revision } = await post("claim", { name: this.name, page });
-      this.writable = writable;
-      if (revision !== this.state.revision && !this.acting) await this.reload();
-    } catch (error) {
-      this.writable = false;
-      this.warning = `the server does not answer: ${error.message}`;
-      this.showWarning();
-      return;
-    }
-    this.warning = "";
-    this.showWarning();
-  }
-
-  showWarning() {
-    const reasons = [this.warning];
-    if (!this.writable && !this.warning)
-      reasons.push(
-        "Another page has this recording open: it can be looked at here, and corrected once that page is closed.",
-      );
-    if (!this.state.has_calibration)
-      reasons.push("The tracks hold no cameras, so nothing can be corrected; track again.");
-    reasons.push(...this.state.unfit);
+  showWarning(problem = this.problem ?? "") {
+    this.problem = problem;
+    const { writable, lost } = this.corrector,
+      { locked, has_calibration: calibrated, unfit, doubtful } = this.state;
+    const elsewhere = !writable && !problem;
+    const reasons = [problem];
+    if (elsewhere && lost) reasons.push("Another page has taken over this recording; it can be looked at here.");
+    else if (elsewhere)
+      reasons.push("Another page has this recording open: it can be looked at here, and corrected once that page is closed.");
+    if (locked) reasons.push(`Nothing can be corrected: ${locked}`);
+    if (!calibrated) reasons.push("The tracks hold no cameras, so nothing can be corrected; track again.");
+    reasons.push(...unfit);
+    if (doubtful.length)
+      reasons.push("Some corrections were made on other tracks. They are applied; say in the list of corrections which still hold.");
     const text = reasons.filter(Boolean).join(" ");
-    $("#warning").textContent = text;
+    $("#warning-text").textContent = text;
     $("#warning").hidden = !text;
-    document.body.dataset.writable = String(this.writable);
-    for (const button of document.querySelectorAll(
-      "[data-do]:not([data-do=earlier]):not([data-do=later]), #undo, #redo",
-    ))
-      button.disabled = !this.writable;
-    if (this.writable) {
+    $("#take-over").hidden = !elsewhere;
+    document.body.dataset.writable = String(writable);
+    const able = writable && !locked;
+    for (const button of document.querySelectorAll("[data-do], #undo, #redo, #corrections button")) button.disabled = !able;
+    if (able) {
       $("#undo").disabled = !this.state.corrections.length;
       $("#redo").disabled = !this.state.redo;
     }
@@ -164,38 +156,16 @@ export class Recording {
   }
 
   plotMarker() {
+    const marker = this.selected.at(-1) ?? 0;
+    const title = `${this.state.names[marker] ?? ""} in camera ${this.camera}, over the rows of the tracks`;
     return this.plots
-      .load(this.name, this.selected.at(-1) ?? 0, this.camera)
+      .load(this.name, marker, this.camera, title)
       .catch((error) => this.say(error.message, true));
   }
 
   say(text, bad = false) {
     $("#message").textContent = text;
     $("#message").classList.toggle("bad", bad);
-  }
-
-  // Do what the server calls an action, one after the other, and show what it changed.
-  act(action) {
-    const meant = { row: this.row, ...action }; // what is shown now, not when its turn comes
-    this.busy = this.busy.then(() => this.perform(meant));
-    return this.busy;
-  }
-
-  async perform(action) {
-    if (!this.writable) return this.say("Another page has this recording; it cannot be corrected here.", true);
-    document.body.dataset.acting = "yes";
-    this.acting = true;
-    try {
-      const answer = await post("correct", { name: this.name, page }, action);
-      this.say(answer.message);
-      await this.take(answer);
-      return answer;
-    } catch (error) {
-      this.say(error.message, true);
-    } finally {
-      this.acting = false;
-      delete document.body.dataset.acting;
-    }
   }
 
   async reload() {
@@ -214,7 +184,7 @@ export class Recording {
   }
 
   showState() {
-    showCorrections(this.state);
+    showCorrections(this.state, (kind, entry) => this.corrector.act({ kind, entry }));
     showNotes(this.state.notes);
     this.showWarning();
     $("#names").replaceChildren(
@@ -262,6 +232,13 @@ export class Recording {
     });
   }
 
+  later() {
+    this.goTo(Math.floor(this.current) + 1);
+  }
+  earlier() {
+    this.goTo(Math.ceil(this.current) - 1);
+  }
+
   // A stretch belongs to the marker and the place for which it was chosen.
   clearStretch() {
     $("#from").value = $("#to").value = "";
@@ -276,81 +253,6 @@ export class Recording {
   marker() {
     if (!this.selected.length) throw new Error("Click on a marker first.");
     return this.state.names[this.selected.at(-1)];
-  }
-
-  async do(what) {
-    try {
-      if (what !== "later" && what !== "earlier") await this.going; // what is done is done to what is shown
-      const camera = this.camera;
-      if (what === "later") this.goTo(Math.floor(this.current) + 1);
-      else if (what === "earlier") this.goTo(Math.ceil(this.current) - 1);
-      else if (what === "swap") {
-        if (this.selected.length !== 2)
-          throw new Error("Click on a marker, and with Shift on a second one, to swap them.");
-        const [marker, other] = this.selected.map((index) => this.state.names[index]);
-        await this.act({ kind: "swap", camera, marker, other });
-      } else if (what === "delete")
-        await this.act({
-          kind: "delete",
-          camera,
-          marker: this.marker(),
-          ...this.stretch(),
-          all_cameras: $("#everywhere").checked,
-        });
-      else if (what === "accept") {
-        await this.act({ kind: "accept", camera, marker: this.marker(), ...this.stretch() });
-      } else if (what === "rename") {
-        if (!$("#name").value) throw new Error("Type the new name first.");
-        await this.act({ kind: "rename", camera, marker: this.marker(), other: $("#name").value });
-      } else if (what === "follow") await this.follow(camera, this.marker());
-      else if (what === "add") {
-        const name = $("#name").value || this.marker();
-        this.adding = name;
-        this.say(`Click on the dot of ${name}.`);
-      } else await this.act({ kind: what });
-    } catch (error) {
-      this.say(error.message, true);
-    }
-  }
-
-  // A marker that was lost is followed on from where it is put back.
-  async move(camera, marker, x, y, hand) {
-    const name = this.state.names[marker],
-      row = this.row,
-      { block, at } = this.data.at(row);
-    const lost = block.cameras[camera].kind[at * this.state.names.length + marker] !== 1;
-    const answer = await this.act({
-      kind: "place",
-      camera,
-      marker: name,
-      x,
-      y,
-      hand,
-      sigma: Number($("#sigma").value) || 1,
-    });
-    if (answer && lost && !hand) await this.follow(camera, name, row);
-  }
-
-  async add(camera, x, y) {
-    const marker = this.adding;
-    this.adding = false;
-    const isNew = !this.state.names.includes(marker),
-      row = this.row;
-    const answer = await this.act({ kind: "place", camera, marker, x, y, new: isNew });
-    if (!answer) return;
-    $("#name").value = "";
-    this.select(this.state.names.indexOf(marker), false);
-    await this.follow(camera, marker, row);
-  }
-
-  async follow(camera, marker, first = this.row) {
-    this.following = true;
-    for (let row = first; this.following;) {
-      const answer = await this.act({ kind: "follow", camera, marker, row });
-      if (!answer?.more) break;
-      row = answer.row;
-    }
-    this.following = false;
   }
 
   async play() {
@@ -370,59 +272,28 @@ export class Recording {
     for (const button of document.querySelectorAll("[data-do]"))
       on(button, "click", () => {
         button.blur();
-        this.do(button.dataset.do);
+        this.corrector.do(button.dataset.do);
       });
+    on($("#later"), "click", () => this.later());
+    on($("#earlier"), "click", () => this.earlier());
+    on($("#take-over"), "click", () => {
+      $("#taking").returnValue = "no";
+      $("#taking").showModal();
+    });
+    on($("#taking"), "close", () => $("#taking").returnValue === "yes" && this.corrector.takeOver());
     on($("#previous"), "click", () => this.show(this.row - 1));
     on($("#next"), "click", () => this.show(this.row + 1));
     on($("#play"), "click", () => {
       $("#play").blur();
       this.play();
     });
-    on($("#undo"), "click", () => this.do("undo"));
-    on($("#redo"), "click", () => this.do("redo"));
+    on($("#undo"), "click", () => this.corrector.do("undo"));
+    on($("#redo"), "click", () => this.corrector.do("redo"));
     on($("#help"), "click", () => $("#keys").showModal());
     on($("#row"), "change", () => this.show(Number($("#row").value)));
     on($("#all"), "change", () => this.loadStretches());
-    on(window, "keydown", (event) => this.onKey(event));
+    on(window, "keydown", (event) => onKey(this, event));
   }
 
-  onKey(event) {
-    if (event.target.matches("input, dialog *") || event.altKey || event.metaKey) return;
-    const step = event.shiftKey ? 10 : 1;
-    const keys = {
-      ArrowLeft: () => this.show(this.asked - step),
-      ArrowRight: () => this.show(this.asked + step),
-      Home: () => this.show(0),
-      End: () => this.show(this.state.rows - 1),
-      " ": () => this.play(),
-      n: () => this.do("later"),
-      p: () => this.do("earlier"),
-      s: () => this.do("swap"),
-      d: () => this.do("delete"),
-      f: () => this.do("follow"),
-      a: () => this.do("add"),
-      Enter: () => this.do("accept"),
-      "[": () => {
-        $("#from").value = this.row;
-      },
-      "]": () => {
-        $("#to").value = this.row;
-      },
-      0: () => this.views.forEach((view) => view.whole()),
-      e: () => {
-        for (const view of this.views) view.ellipse = (view.ellipse + 1) % 3;
-        this.redraw();
-      },
-      "?": () => $("#keys").showModal(),
-      Escape: () => {
-        this.adding = this.following = false;
-        this.say("");
-      },
-    };
-    const withControl = { z: () => this.do("undo"), y: () => this.do("redo") };
-    const call = event.ctrlKey ? withControl[event.key] : keys[event.key];
-    if (!call) return;
-    event.preventDefault();
-    call();
-  }
+
 }
