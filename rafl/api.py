@@ -26,6 +26,7 @@ from rafl.data.dataset_file import read_dataset, write_dataset
 from rafl.data.markers import Markers
 from rafl.data.objective import Recordings
 from rafl.data.synthetic import load_force
+from rafl.data.views import View
 from rafl.evaluation.metrics import compare, error_table
 from rafl.fem.laws import register_law
 from rafl.fem.material import Material
@@ -64,6 +65,7 @@ __all__ = [
     "Start",
     "Tracks",
     "Trajectory",
+    "View",
     "build_dataset",
     "calibrate",
     "equilibrium",

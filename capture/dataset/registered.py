@@ -135,7 +135,8 @@ def average_views(views: dict[str, View], near: Array) -> tuple[Array, Array, Ar
     for name, view in views.items():
         known = np.isfinite(near[:, :1])
         pixel, sigma = average_frames(view.pixel, np.sqrt(np.diagonal(view.covariance, axis1=-2, axis2=-1)))
-        pixel = np.where(known & np.isfinite(sigma), pixel, np.nan)
+        seen = known & np.isfinite(sigma)
+        pixel, sigma = np.where(seen, pixel, np.nan), np.where(seen, sigma, np.nan)
         means[name] = replace(
             view, pixel=pixel[None], covariance=(sigma**2)[None, ..., None] * np.eye(2), lag=np.zeros(1)
         )

@@ -108,7 +108,17 @@ def fit(
 
 
 def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify: Callable[[str], None]) -> None:
-    """Report processes that get no recording, and pre-training that no dataset allows."""
+    """Report pixels that are not compared, processes that get no recording, and pre-training that cannot be done."""
+    with_views = [[bool(item.views) for item in dataset.trajectories.values()] for dataset in datasets]
+    in_space = settings.objective == "3d"
+    if settings.by_sigma and not in_space and all(all(each) for each in with_views):
+        notify("--by-sigma has no effect: pixels are weighted by their covariance; it is for --objective 3d")
+    for dataset, each in zip(datasets, with_views, strict=True):
+        if any(each) and not all(each) and not in_space:
+            notify(
+                f"{dataset.name}: some recordings have no pixels; where they are compared together with others, "
+                "all are by their 3-D positions; build the dataset again from tracks"
+            )
     if process_count() > settings.batch:
         notify(f"{process_count()} processes share a batch of {settings.batch}: raise --batch to use them all")
     if settings.method == "rafl" and pretraining_unavailable(datasets, settings):

@@ -115,7 +115,9 @@ def launch() -> Iterator[Callable[[Path], Served]]:
 
     def start(folder: Path) -> Served:
         program = "from rafl.review.cli import review_app; review_app()"
-        line = [sys.executable, "-c", program, str(folder), "--no-browser", "--name", "Ann"]
+        is_run = (folder / "evaluation.h5").exists()
+        named = [] if is_run else ["--name", "Ann"]
+        line = [sys.executable, "-c", program, str(folder), "--no-browser", *named]
         environment = os.environ | {"PYTHONUNBUFFERED": "1"}
         process = subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, env=environment)
         running.append(process)

@@ -14,6 +14,7 @@ from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, write_dataset
 from rafl.data.objective import Recordings, frame_errors, loss_curvature, recording_losses, training_loss
 from rafl.data.views import View, at_lags, seen_axes
+from rafl.fitting.fit import fit
 
 CAMERAS = {"left": side_camera(0.0), "right": side_camera(np.pi / 2)}
 
@@ -209,3 +210,16 @@ def test_parts_of_recordings_keep_their_pixels(dataset: Dataset) -> None:
     for own, expected in zip(part.gaps(simulated), whole, strict=True):
         np.testing.assert_allclose(own.numpy(), expected.numpy(), atol=1e-15)
     np.testing.assert_allclose(part.limit.numpy(), recordings.limit[[2, 0]].numpy())
+
+
+def test_settings_without_effect_on_pixels_are_told(dataset: Dataset, tmp_path: Path) -> None:
+    with_views = filmed(dataset, CAMERAS)
+    mixed = {**with_views.trajectories, "c": dataset.trajectories["c"]}
+    write_dataset(tmp_path / "all.h5", with_views)
+    write_dataset(tmp_path / "some.h5", replace(with_views, trajectories=mixed))
+    for name, message in (("all", "--by-sigma has no effect"), ("some", "some recordings have no pixels")):
+        told: list[str] = []
+        options = {"method": "sysid-e", "epochs": 1, "frames": 3, "by_sigma": True, "notify": told.append}
+        fit(tmp_path / f"{name}.h5", tmp_path / name, **options)  # type: ignore[arg-type]
+        assert len(told) == 1
+        assert message in told[0]

@@ -125,7 +125,7 @@ def test_source_is_recorded_only_below_the_file(tmp_path: Path, calib: Path) -> 
 def test_command_refuses_what_it_cannot_show(tmp_path: Path, calib: Path, run: Run) -> None:
     text = calib.read_text()
     assert_refused(run("rafl-review", "no.yaml"), "no.yaml", "check the path")
-    assert_refused(run("rafl-review", calib, "--videos", "."), "--videos", "folder of tracks only")
+    assert_refused(run("rafl-review", calib, "--videos", "."), "--videos", "expected a folder of tracks")
     assert_refused(run("rafl-review", calib, "--images", "nowhere"), "nowhere", "a folder of board images")
     (tmp_path / "tracks").mkdir()
     assert_refused(run("rafl-review", "tracks", "--images", "."), "--images", "calib.yaml")
