@@ -8,7 +8,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install demo test test-slow fuzz lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
-	bench-simulator bench-tracking bench-paper bench-capture bench-places bench-sim2real bench-labs bench-laws bench-mesh laws clean
+	bench-simulator bench-tracking bench-paper bench-capture bench-places bench-sim2real bench-labs bench-laws bench-mesh bench-image laws clean
 
 install: $(VENV)/installed $(VENV)/kernels
 
@@ -135,6 +135,11 @@ bench-capture: install
 # A specimen whose dots are off their described places: are the places found, and E?
 bench-places: install
 	$(BIN)/python tests/bench/places.py
+
+# One camera or two, compared in the image plane and in space; 95 % intervals from pixels.
+bench-image: install
+	$(BIN)/python tests/bench/image_objective.py
+	$(BIN)/python tests/bench/image_intervals.py
 
 clean:
 	rm -rf build $(VENV)
