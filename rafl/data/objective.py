@@ -356,14 +356,12 @@ def loss_curvature(recordings: Recordings, simulated: Tensor, slope: Tensor) -> 
     return 2.0 * LOSS_SCALE * products / len(steps)
 
 
-def frame_errors(recordings: Recordings, simulated: Tensor) -> list[NDArray[np.float64]]:
-    """For each recording, the mean distance of the observed markers in every frame with any [m], (T_r).
+def marker_distances(recordings: Recordings, simulated: Tensor) -> Tensor:
+    """Distances of simulated markers from what was seen of them [m], (T, B, M), NaN where nothing was.
 
     Of a marker that several cameras saw it is the distance in space; of one that a single camera saw, the distance in
-    the image divided by the scale there; in recordings of positions, the distance in space. Its average over frames and
-    recordings is the paper's error (eq. sim2real_evaluation).
+    the image divided by the scale there; in recordings of positions, the distance in space.
     """
-    observed = recordings.observed
     distance = torch.linalg.norm(simulated - recordings.markers, dim=-1)
     if recordings.terms:
         count = torch.stack([term.seen for term in recordings.terms.values()]).sum(0)
@@ -371,13 +369,14 @@ def frame_errors(recordings: Recordings, simulated: Tensor) -> list[NDArray[np.f
         for term in recordings.terms.values():
             in_image += term.seen * torch.linalg.norm(term.gap(simulated), dim=-1) / term.scale
         distance = torch.where((count > 1) & (recordings.valid > 0), distance, in_image / count.clamp_min(1.0))
-    distance = distance * observed
-    total = observed.sum(-1)
-    mean = (distance.sum(-1) / total.clamp_min(1.0)).detach().numpy()
-    return [mean[rows, b] for b, rows in enumerate(observed_frames(recordings))]
+    return torch.where(recordings.observed > 0, distance, torch.nan)
 
 
-def observed_frames(recordings: Recordings) -> list[NDArray[np.int64]]:
-    """For each recording, the frames in which a marker was observed, (T_r)."""
-    seen = recordings.observed.amax(-1).numpy() > 0
-    return [np.flatnonzero(column) for column in seen.T]
+def frame_errors(recordings: Recordings, simulated: Tensor) -> list[NDArray[np.float64]]:
+    """For each recording, the mean distance of the observed markers in every frame with any [m], (T_r).
+
+    Its average over frames and recordings is the paper's error (eq. sim2real_evaluation).
+    """
+    distance = marker_distances(recordings, simulated)
+    mean, seen = distance.nanmean(-1).detach().numpy(), ~distance.isnan().all(-1).numpy()
+    return [mean[seen[:, b], b] for b in range(mean.shape[1])]

@@ -25,7 +25,7 @@ FORMAT = "rafl-evaluation/1"
 UNITS = "SI: m, s, N; specimen frame"
 MAX_MOTION_BYTES = 400_000_000  # of all bodies in a file, uncompressed; further recordings have none
 LABEL, ADVICE = "an evaluation written by rafl-eval", "run rafl-eval again"  # in messages about unreadable files
-# T: frames, T': frames in which a marker was seen, M: markers, B, S, C: vertices, faces and cells at the boundary.
+# T: frames, M: markers, B, S, C: vertices, faces and cells at the boundary.
 RECORDING_ARRAYS = {
     "time": ArrayFormat(("T",)),
     "recorded": ArrayFormat(("T", "M", 3), finite=False),
@@ -35,7 +35,7 @@ RECORDING_ARRAYS = {
 }
 METHOD_ARRAYS = {
     "markers": ArrayFormat(("T", "M", 3)),
-    "errors": ArrayFormat(("T'",), low=0.0),
+    "distances": ArrayFormat(("T", "M"), finite=False, low=0.0),
     "vertices": ArrayFormat(("T", "B", 3), optional=True),
     "strain": ArrayFormat(("T", "C"), low=0.0, optional=True),
     "force": ArrayFormat(("T-1", "B"), low=0.0, optional=True),
@@ -74,12 +74,12 @@ def write_evaluation(path: Path, evaluation: Evaluation) -> None:
             group["marker_names"] = np.array(item.marker_names, dtype=h5py.string_dtype())
             group["faces"], group["cells"] = item.surface.faces, item.surface.cells
             _write_array(group, "recorded", item.recorded)
-            for index, (method, errors) in enumerate(item.errors.items()):
+            for index, (method, distances) in enumerate(item.distances.items()):
                 own = group.create_group(f"methods/{index}")
                 own.attrs["method"] = _text(method)
-                own["errors"] = errors
                 own["strain_range"] = [item.strains[method].strain, item.strains[method].rate]
                 _write_array(own, "markers", item.simulated[method])
+                _write_array(own, "distances", distances)
                 motion = vars(item.motions[method]) if number in kept else {}
                 for key, value in motion.items():
                     if value is not None:
@@ -117,9 +117,9 @@ def read_evaluation(path: Path) -> Evaluation:
         check_format(str(file.attrs.get("format", "")), FORMAT, path)
         groups = file["recordings"]
         comparisons = [_read(groups[key], f"recordings/{key}") for key in sorted(groups, key=int)]
-        methods = {item.dataset: set(item.errors) for item in comparisons}
+        methods = {item.dataset: set(item.distances) for item in comparisons}
         for number, item in enumerate(comparisons):
-            if set(item.errors) != methods[item.dataset]:
+            if set(item.distances) != methods[item.dataset]:
                 raise ValueError(f"recordings/{number}: expected the methods of the dataset's other recordings")
         models = str(file.attrs["models"])
     if not comparisons:
@@ -130,8 +130,7 @@ def read_evaluation(path: Path) -> Evaluation:
 def _read(group: h5py.Group, label: str) -> Comparison:
     lengths: dict[str, int] = {}
     found = read_arrays(group, RECORDING_ARRAYS, lengths, f"{label}/")
-    seen = np.isfinite(found["recorded"]).all(axis=-1).any(axis=-1)
-    lengths |= {"T-1": lengths["T"] - 1, "T'": int(seen.sum())}
+    lengths["T-1"] = lengths["T"] - 1
     methods = {}
     for key in sorted(group["methods"], key=int):
         own = group["methods"][key]
@@ -150,15 +149,16 @@ def _read(group: h5py.Group, label: str) -> Comparison:
     for key, bound in (("faces", "B"), ("cells", "C")):
         if not found[key].size or (all(bodies) and found[key].max() >= lengths[bound]):
             raise ValueError(f"{label}/{key}: expected indices below {lengths.get(bound, 0)}")
-    if not seen.any() or (np.diff(found["time"]) <= 0).any():
-        raise ValueError(f"{label}: expected markers that are seen, at times that grow")
+    seen = [np.isfinite(own["distances"]) for own in methods.values()]
+    alike = all((each == seen[0]).all() for each in seen)
+    if not (alike and seen[0].any()) or (np.diff(found["time"]) <= 0).any():
+        raise ValueError(f"{label}: expected markers that are seen, the same for all methods, at times that grow")
     return Comparison(
         **names,
         time=found["time"],
         recorded=found["recorded"],
         simulated={method: own["markers"] for method, own in methods.items()},
-        errors={method: own["errors"] for method, own in methods.items()},
-        error_time=found["time"][seen],
+        distances={method: own["distances"] for method, own in methods.items()},
         marker_names=found["marker_names"],
         surface=Surface(found["faces"], found["cells"]),
         motions={method: _motion(own) for method, own in methods.items() if all(bodies)},

@@ -1,7 +1,7 @@
 """Marker errors of the baseline simulator and of fitted models on recordings, as the paper defines them."""
 
 from dataclasses import dataclass
-from functools import reduce
+from functools import cached_property, reduce
 
 import numpy as np
 import pandas as pd
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import SPLITS, Dataset
-from rafl.data.objective import Recordings, frame_errors, observed_frames
+from rafl.data.objective import Recordings, marker_distances
 from rafl.data.strain_range import StrainRange
 from rafl.evaluation.oscillation import fit_oscillation, most_active_coordinate, rest_position_error
 from rafl.evaluation.surface import Surface, SurfaceMotion
@@ -28,8 +28,8 @@ class Comparison:
         time: [s], (T).
         recorded: marker positions [m], (T, M, 3), NaN where not seen.
         simulated: by method, marker positions [m], (T, M, 3).
-        errors: by method, mean distance of the seen markers [m] in each frame that has any, (T').
-        error_time: the times of those frames [s], (T').
+        distances: by method, distances of the markers from what was seen of them [m], (T, M), NaN where nothing was;
+            see `rafl.data.objective.marker_distances`.
         marker_names: (M).
         surface: boundary of the specimen's mesh.
         motions: by method, the motion of that boundary; empty where it was not kept.
@@ -42,12 +42,27 @@ class Comparison:
     time: NDArray[np.float64]
     recorded: NDArray[np.float64]
     simulated: dict[str, NDArray[np.float64]]
-    errors: dict[str, NDArray[np.float64]]
-    error_time: NDArray[np.float64]
+    distances: dict[str, NDArray[np.float64]]
     marker_names: tuple[str, ...]
     surface: Surface
     motions: dict[str, SurfaceMotion]
     strains: dict[str, StrainRange]
+
+    @cached_property
+    def _seen(self) -> NDArray[np.bool_]:
+        """Frames in which a marker was seen, (T)."""
+        distances = next(iter(self.distances.values()), np.full(self.recorded.shape[:2], np.nan))
+        return np.asarray(np.isfinite(distances).any(axis=1))
+
+    @cached_property
+    def errors(self) -> dict[str, NDArray[np.float64]]:
+        """By method, mean distance of the seen markers [m] in each frame that has any, (T')."""
+        return {method: np.nanmean(distance[self._seen], axis=1) for method, distance in self.distances.items()}
+
+    @property
+    def error_time(self) -> NDArray[np.float64]:
+        """The times of those frames [s], (T')."""
+        return self.time[self._seen]
 
 
 def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison]:
@@ -60,7 +75,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
     names = list(dataset.trajectories)
     recordings = Recordings.of(dataset, names)
     mesh, lengths = dataset.simulator.mesh, [len(dataset.trajectories[name].time) for name in names]
-    simulated, errors, motions, strains = {}, {}, {}, {}
+    simulated, distances, motions, strains = {}, {}, {}, {}
     with torch.no_grad():
         for method, model in {BASELINE: FittedModel(BASELINE), **models}.items():
             simulator = model.simulator(dataset.simulator)
@@ -76,8 +91,8 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
             strains[method] = [
                 StrainRange.of(simulator.mesh, q[:, b : b + 1], simulator.time_step) for b in range(len(names))
             ]
-            errors[method] = frame_errors(recordings, markers)
-    result, frames, surface = [], observed_frames(recordings), Surface.of(mesh)
+            distances[method] = marker_distances(recordings, markers).numpy()
+    result, surface = [], Surface.of(mesh)
     for b, name in enumerate(names):
         item = dataset.trajectories[name]
         result.append(
@@ -88,8 +103,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
                 item.time,
                 np.where(item.valid[..., None], item.markers, np.nan),
                 {method: markers[: len(item.time), b] for method, markers in simulated.items()},
-                {method: values[b] for method, values in errors.items()},
-                item.time[frames[b]],
+                {method: values[: len(item.time), b] for method, values in distances.items()},
                 dataset.markers.names,
                 surface,
                 {method: values[b] for method, values in motions.items()},

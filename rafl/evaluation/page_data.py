@@ -70,8 +70,7 @@ class PageData:
                 time=item.time,
                 recorded=np.where(item.valid[..., None], item.markers, np.nan),
                 simulated={},
-                errors={},
-                error_time=item.time[:0],
+                distances={},
                 marker_names=dataset.markers.names,
                 surface=surface,
                 motions={"body of the first frame": SurfaceMotion.of(mesh, item.q[None])},
@@ -140,8 +139,7 @@ def pack_motion(item: Comparison, max_frames: int | None = None) -> bytes:
         if motion.force is not None:
             arrays.append(("force", method, motion.force))
     for method, markers in item.simulated.items():
-        distance = np.linalg.norm(markers - item.recorded, axis=-1)
-        arrays += [("markers", method, markers), ("error", method, distance)]
+        arrays += [("markers", method, markers), ("error", method, item.distances[method])]
     described, contents = [], []
     for key, method, values in arrays:
         about, content = _encode(values[::stride])

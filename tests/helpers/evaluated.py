@@ -50,11 +50,7 @@ def make_comparison(
         time=time,
         recorded=recorded,
         simulated=simulated,
-        errors={
-            method: np.nanmean(np.linalg.norm(markers - recorded, axis=-1), axis=1)
-            for method, markers in simulated.items()
-        },
-        error_time=time,
+        distances={method: np.linalg.norm(markers - recorded, axis=-1) for method, markers in simulated.items()},
         marker_names=tuple(f"m{number}" for number in range(len(MARKED))),
         surface=Surface.of(MESH),
         motions={

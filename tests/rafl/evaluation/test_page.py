@@ -74,8 +74,8 @@ def test_constant_and_missing_values_are_packed() -> None:
 
 def test_tables_hold_what_was_evaluated() -> None:
     worse = make_comparison("load100g", dataset="plate")
-    errors = {BASELINE: worse.errors[BASELINE], "rafl": 3.0 * worse.errors[BASELINE]}
-    comparisons = [*make_evaluation(count=4).comparisons, replace(worse, errors=errors)]
+    distances = {BASELINE: worse.distances[BASELINE], "rafl": 3.0 * worse.distances[BASELINE]}
+    comparisons = [*make_evaluation(count=4).comparisons, replace(worse, distances=distances)]
     tables = {table["title"]: table for table in page_tables(comparisons)}
     assert list(tables) == [
         "Error of simulated markers",
