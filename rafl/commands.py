@@ -167,13 +167,14 @@ def _describe(model: FittedModel) -> str:
     return " on ".join(parts) + integration
 
 
-def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
+def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool) -> None:
     """Simulate every recording with the baseline simulator and every model; write tables and a report.
 
     Args:
         runs: run folders of the models.
         files: dataset files.
         folder: where errors.csv, motions.csv, errors.tex and report.html are written.
+        report: whether report.html is written.
 
     Raises:
         InputError: a run or a dataset cannot be read, or a model is applicable to none of the datasets.
@@ -194,8 +195,9 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
         "errors.csv": _spreadsheet(recordings),
         "motions.csv": _spreadsheet(motions),
         "errors.tex": latex_table(splits),
-        "report.html": report_page(comparisons, splits, recordings, motions, description),
     }
+    if report:
+        texts["report.html"] = report_page(comparisons, splits, recordings, motions, description)
     transfer = Transfer.of(splits)
     if transfer.errors.shape[1] > 1:
         errors = transfer.errors.rename(index=spreadsheet_text, columns=spreadsheet_text)
@@ -216,7 +218,8 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
         typer.echo(f"held-out marker error: {values}")
     else:
         typer.echo("no recording has split `test`, so this error is not of held-out recordings", err=True)
-    typer.echo(f"report: {folder / 'report.html'} (open it in a browser)")
+    if report:
+        typer.echo(f"report: {folder / 'report.html'} (open it in a browser)")
 
 
 def _spreadsheet(table: pd.DataFrame) -> str:

@@ -48,7 +48,7 @@ def fit(
             (residual acceleration field), `srl` (supervised baseline), `sysid` (E and nu), `sysid-e` (E at nu = 0.499),
             `sysid-damping` (E, nu and viscosity), `sysid-loss` (E, nu and loss factor) or `sysid-branches` (E, nu
             and Maxwell branches).
-        resume: continue the interrupted run in the folder; the settings must be the same.
+        resume: continue the interrupted run in the folder, if there is one; the settings must be the same.
         report: called with every row of the history.
         notify: called with a message for every setting that has no effect.
         epochs: maximum number of passes over the recordings; by method if None.
@@ -112,14 +112,14 @@ def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify:
 
 @contextmanager
 def open_run(run: Path, settings: Settings, resume: bool) -> Iterator[None]:
-    """Create a run folder, or reopen one to resume its run. Two runs never share a folder.
+    """Create a run folder, or reopen one to resume its run, if there is one. Two runs never share a folder.
 
     A new folder is removed if the run fails before it has saved anything to resume from.
 
     Raises:
         InputError: the folder already holds a run or, when resuming, a run with other settings.
     """
-    if resume:
+    if resume and (run / SETTINGS_FILE).exists():
         earlier = read_settings(run)
         if earlier != settings:
             raise InputError(
