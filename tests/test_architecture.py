@@ -22,6 +22,7 @@ INSIDE = {
     "rafl": ["evaluation", "fitting", "residual", "data", "simulation", "solvers", "fem"],
     "tracking": [
         "cli",
+        "unit_commands",
         "commands|calibration_commands",
         "rest|report|pipeline",
         "overlay|single_marker",
@@ -30,7 +31,16 @@ INSIDE = {
         "detection",
         "reconstruction",
     ],
-    "capture": ["cli", "commands", "report", "rendering|description", "dataset", "registration", "specimen"],
+    "capture": [
+        "cli",
+        "unit_commands",
+        "commands",
+        "report",
+        "rendering|description",
+        "dataset",
+        "registration",
+        "specimen",
+    ],
 }
 FOLDERS = {"rafl": "rafl", "tracking": "rafl.tracking", "capture": "rafl.capture", "calibration": "rafl.calibration"}
 MOST_MODULES = 14

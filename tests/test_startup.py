@@ -44,6 +44,10 @@ REFUSED = [
     ["rafl-fit", "absent.h5", "--method", "magic"],
     ["rafl-eval", "run"],
     ["rafl-eval", "run", "absent.h5"],
+    ["rafl-fit", __file__, "--on", "local", "--cluster", "absent.yaml"],
+    ["rafl-sweep", "absent.yaml"],
+    ["rafl-sweep", "absent", "--status"],
+    ["rafl-sweep", ".", "--on", "slurm"],
     ["rafl-review", "absent"],
     ["rafl-review", ".", "--videos", "absent"],
 ]
