@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import submitit
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from rafl.batch.json_files import read_json, write_json
 from rafl.batch.runner import run_unit
 from rafl.batch.state import Book, Status
 from rafl.batch.unit import Unit
 from rafl.common.errors import InputError
+from rafl.common.names import check_visible
 from rafl.common.yaml_files import StrictModel, read_yaml
 
 FORMAT = "rafl-cluster/1"
@@ -27,6 +28,8 @@ PATIENCE_S = 600.0  # for a controller that does not answer
 JOB_NAME = "rafl"
 
 Positive = Annotated[int, Field(ge=1)]
+Line = Annotated[str, AfterValidator(check_visible)]
+OptionalLine = Annotated[str, AfterValidator(lambda text: text and check_visible(text))]
 
 
 class Cluster(StrictModel):
@@ -44,18 +47,18 @@ class Cluster(StrictModel):
         options: further options of sbatch, by name.
     """
 
-    partition: str = ""
-    account: str = ""
-    qos: str = ""
-    constraint: str = ""
+    partition: OptionalLine = ""
+    account: OptionalLine = ""
+    qos: OptionalLine = ""
+    constraint: OptionalLine = ""
     minutes: Positive = 60
     cpus: Positive = 1
     memory_gb: Annotated[float, Field(gt=0.0)] = 4.0
     at_once: Positive = 256
     array_size: Positive = 1000
     units_per_task: Positive = 1
-    setup: tuple[str, ...] = ()
-    options: dict[str, str | int | bool] = Field(default_factory=dict)
+    setup: tuple[Line, ...] = ()
+    options: dict[Line, OptionalLine | int | bool] = Field(default_factory=dict)
 
 
 class _ClusterFile(Cluster):
