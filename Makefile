@@ -8,7 +8,7 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install demo test test-slow fuzz lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
-	bench-simulator bench-tracking bench-paper bench-capture bench-places bench-sim2real bench-labs bench-laws bench-mesh laws clean
+	bench-simulator bench-tracking bench-paper bench-capture bench-places bench-sim2real bench-labs bench-laws bench-mesh bench-cluster laws clean
 
 install: $(VENV)/installed $(VENV)/kernels
 
@@ -131,6 +131,10 @@ bench-capture: install
 # A specimen whose dots are off their described places: are the places found, and E?
 bench-places: install
 	$(BIN)/python tests/bench/places.py
+
+# Sixty small recordings by --on local and by SLURM with failures on the way (slurm-wlm and munge; root).
+bench-cluster: install
+	$(BIN)/python tests/bench/cluster.py
 
 clean:
 	rm -rf build $(VENV)

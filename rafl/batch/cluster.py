@@ -26,6 +26,7 @@ MAX_JOBS_BYTES = 100_000_000
 SQUEUE_TIMEOUT_S = 60.0
 PATIENCE_S = 600.0  # for a controller that does not answer
 JOB_NAME = "rafl"
+COMPLETING = "CG"  # a job whose processes have ended, or whose node does not answer; a unit's lock tells which
 
 Positive = Annotated[int, Field(ge=1)]
 Line = Annotated[str, AfterValidator(check_visible)]
@@ -154,7 +155,7 @@ class ClusterExecutor:
         Raises:
             InputError: it has not answered for long.
         """
-        line = ["squeue", "--noheader", "--array", "--user", getpass.getuser(), "--format", "%i"]
+        line = ["squeue", "--noheader", "--array", "--user", getpass.getuser(), "--format", "%i %t"]
         try:
             found = subprocess.run(line, capture_output=True, text=True, timeout=SQUEUE_TIMEOUT_S, check=True)
         except (OSError, subprocess.SubprocessError) as error:
@@ -165,7 +166,8 @@ class ClusterExecutor:
                 ) from None
             return self.alive or set(self.jobs.values())
         self.answered = time.monotonic()
-        return set(found.stdout.split())
+        pairs = [line.split() for line in found.stdout.splitlines()]
+        return {job for job, state in pairs if state != COMPLETING}
 
     def submit(self, units: Sequence[Unit]) -> None:
         """Submit units as one array.
