@@ -3,10 +3,11 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from rafl.common.errors import InputError
-from rafl.common.files import new_folders
+from rafl.common.files import new_folders, sha256
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.fitting.distributed import process_count, rank
@@ -88,6 +89,7 @@ def fit(
         by_sigma=by_sigma,
         integrator=integrator,
         limit_energy=limit_energy,
+        sha256=tuple(map(sha256, paths)),
     )
     check_inputs(method, loaded, Path(start) if start else None, integrator)
     if process_count() > 1 and method != "rafl":
@@ -117,10 +119,22 @@ def open_run(run: Path, settings: Settings, resume: bool) -> Iterator[None]:
     A new folder is removed if the run fails before it has saved anything to resume from.
 
     Raises:
-        InputError: the folder already holds a run or, when resuming, a run with other settings.
+        InputError: the folder already holds a run or, when resuming, a run with other settings or other datasets.
     """
     if resume and (run / SETTINGS_FILE).exists():
         earlier = read_settings(run)
+        if not earlier.sha256:  # of an earlier version
+            earlier = replace(earlier, sha256=settings.sha256)
+        changed = [
+            path
+            for path, *hashes in zip(earlier.datasets, earlier.sha256, settings.sha256, strict=False)
+            if len(set(hashes)) > 1
+        ]
+        if changed and earlier == replace(settings, sha256=earlier.sha256):
+            raise InputError(
+                f"expected the dataset that the run in {run} began with, found that {changed[0]} has changed; choose "
+                "another --out, or remove the folder to fit again"
+            )
         if earlier != settings:
             raise InputError(
                 f"expected the settings and datasets in {run}/config.yaml to resume, found others; use the same, or "

@@ -20,6 +20,7 @@ from mutations import BY_SUFFIX, pick
 from support import error_lines
 from typer.testing import CliRunner
 
+from rafl.batch.cluster import read_cluster
 from rafl.calibration.board import read_board
 from rafl.calibration.detection.image_file import read_grey_image
 from rafl.calibration.foreign.read import read_any_calibration
@@ -31,10 +32,17 @@ from rafl.cli import eval_app, fit_app
 from rafl.common.command_line import report_errors
 from rafl.data.dataset_file import read_dataset
 from rafl.fitting.run_folder import load_model
+from rafl.sweep.cli import sweep_app
 from rafl.tracking.cli import track_app
 from rafl.tracking.reconstruction.tracks import read_tracks
 
-APPS = {"rafl-capture": capture_app, "rafl-fit": fit_app, "rafl-eval": eval_app, "rafl-track": track_app}
+APPS = {
+    "rafl-capture": capture_app,
+    "rafl-fit": fit_app,
+    "rafl-eval": eval_app,
+    "rafl-sweep": sweep_app,
+    "rafl-track": track_app,
+}
 
 
 def read_foreign(path: Path) -> Rig:
@@ -46,6 +54,7 @@ def read_foreign(path: Path) -> Rig:
 READERS: dict[str, Callable[[Path], object]] = {
     "read_specimen": read_specimen,
     "read_board": read_board,
+    "read_cluster": read_cluster,
     "read_marker_names": read_marker_names,
     "load_model": load_model,
     "read_grey_image": read_grey_image,
@@ -77,6 +86,10 @@ TARGETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "model, evaluate": ("run/model.pt", ("rafl-eval", "run", "data.h5", "--out", "out")),
     "settings": ("run/config.yaml", ("rafl-fit", "data.h5", *FIT, "run", "--resume")),
     "checkpoint": ("run/checkpoint.pt", ("rafl-fit", "data.h5", *FIT, "run", "--resume")),
+    "plan": ("plan.yaml", ("rafl-sweep", "plan.yaml", "--out", "out", "--print-commands")),
+    "cluster": ("cluster.yaml", ("read_cluster", "cluster.yaml")),
+    "units": ("sweep/units/units.json", ("rafl-sweep", "sweep", "--status")),
+    "state of a unit": ("sweep/units/one.json", ("rafl-sweep", "sweep", "--status")),
     "calibration": ("calib.yaml", ("rafl-track", "videos", "--calib", "calib.yaml", "--specimen", "dots.yaml")),
     "aniposelib": ("stereo.toml", ("read_foreign", "stereo.toml")),
     "OpenCV": ("left.yml", ("read_foreign", "left.yml")),

@@ -6,12 +6,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from support import ROOT
 
 from rafl import cli
+from rafl.batch.cluster import read_cluster
 from rafl.batch.plain_command import plain_command
 from rafl.common.errors import InputError
 from rafl.sweep.cells import Sweep, sweep_units
-from rafl.sweep.plan import find_datasets, fit_options, read_plan
+from rafl.sweep.plan import find_datasets, fit_options, read_plan, variants
 
 Units = Callable[..., Sweep]
 
@@ -170,3 +172,15 @@ def test_plain_commands_say_what_was_typed() -> None:
         "rafl-fit", "a b.h5", "./-c.h5", "--seed=-3", "--from", "old", "--by-sigma", "--no-limit-energy"
     )  # fmt: skip
     assert re.fullmatch("[a-z-]+", line[0])
+
+
+def test_the_examples_of_the_documentation_are_read() -> None:
+    folder = ROOT / "datasets" / "sweeps"
+    plan = read_plan(folder / "plan.yaml")
+    assert [variant.label for variant in variants(plan)] == [
+        "auto",
+        "field-warm-start=0",
+        "field-warm-start=20",
+        "field-on-material",
+    ]
+    assert read_cluster(folder / "cluster.yaml").partition == "short"
