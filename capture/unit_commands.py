@@ -9,13 +9,12 @@ import typer
 from rafl.batch.execute import end_of, execute
 from rafl.batch.options import Batch
 from rafl.batch.plain_command import plain_command
+from rafl.batch.state import UNITS_FOLDER
 from rafl.batch.unit import create_unit
 from rafl.capture import cli
 from rafl.capture.dataset.sources import find_sources
 from rafl.capture.dataset.table import read_recording_rows
 from rafl.capture.specimen.specimen import read_specimen
-
-UNITS_FOLDER = "units"
 
 
 def capture(given: Mapping[str, Any], how: Batch) -> None:

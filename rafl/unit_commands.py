@@ -12,12 +12,11 @@ from rafl import cli
 from rafl.batch.execute import end_of, execute
 from rafl.batch.options import Batch
 from rafl.batch.plain_command import plain_command
-from rafl.batch.state import Status
+from rafl.batch.state import UNITS_FOLDER, Status
 from rafl.batch.unit import create_unit
 from rafl.common.errors import InputError
 from rafl.common.files import require_file, written_files
 
-UNITS_FOLDER = "units"
 TABLES = ("errors.csv", "motions.csv")
 
 

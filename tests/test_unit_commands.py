@@ -1,5 +1,6 @@
 """Commands with --on: the files of the plain commands, made by one process for each unit."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ from laboratory import make_laboratory
 from support import Run, assert_refused, folder_content
 
 PLAN = """format: rafl-sweep/1
-datasets: ["*.h5"]
+specimens: ["specimens/*"]
 methods: [sysid-e, {method: rafl, name: field, options: {epochs: 1, frames: 4, warm-start: 0, from: sysid-e}}]
 seeds: [0, 1]
 """
@@ -81,7 +82,11 @@ def test_capture_fit_and_eval_as_units(laboratory: Path, run: Run, tmp_path: Pat
 
 
 def test_a_sweep_from_plan_to_table(laboratory: Path, run: Run, tmp_path: Path) -> None:
-    (tmp_path / "one.h5").write_bytes((laboratory / "data.h5").read_bytes())
+    own = tmp_path / "specimens" / "one"
+    shutil.copytree(laboratory / "tracks", own / "tracks")
+    shutil.copy(laboratory / "small.yaml", own / "specimen.yaml")
+    (own / "recordings.csv").write_text("recording,load_g,split\ntake1,40,train\ntake2,60,val\ntake3,80,test\n")
+    before = folder_content(tmp_path)
     plan = tmp_path / "plan.yaml"
     plan.write_text(PLAN.replace("seeds", "sedes"))
     assert_refused(run("rafl-sweep", "plan.yaml"), "plan.yaml", "sedes")
@@ -89,12 +94,12 @@ def test_a_sweep_from_plan_to_table(laboratory: Path, run: Run, tmp_path: Path) 
     assert_refused(run("rafl-sweep", "plan.yaml", "--status", "--print-commands"), "leave one out")
     assert_refused(run("rafl-sweep", "plan.yaml", "--cluster", "plan.yaml"), "--cluster", "--on slurm")
     assert_refused(run("rafl-sweep", ".", "--status"), "units.json", "found nothing")
-    assert "6 units: 6 waiting" in run("rafl-sweep", "plan.yaml", "--status").stdout
-    assert folder_content(tmp_path) == {"one.h5", "plan.yaml"}
+    assert "7 units: 7 waiting" in run("rafl-sweep", "plan.yaml", "--status").stdout
+    assert folder_content(tmp_path) == before | {"plan.yaml"}
     result = run("rafl-sweep", "plan.yaml", "--jobs", "2", "--out", "a sweep")
     assert result.returncode == 0, result.stderr
-    assert "6 units: 6 done" in result.stdout
-    assert "6 units: 6 done" in run("rafl-sweep", "a sweep", "--status").stdout
+    assert "7 units: 7 done" in result.stdout
+    assert "7 units: 7 done" in run("rafl-sweep", "a sweep", "--status").stdout
     errors = pd.read_csv(tmp_path / "a sweep" / "results.csv", keep_default_na=False)
     assert errors["method"].value_counts().to_dict() == {"original": 3, "sysid-e": 3, "field": 6}
     summary = pd.read_csv(tmp_path / "a sweep" / "summary.csv", keep_default_na=False)
@@ -102,6 +107,6 @@ def test_a_sweep_from_plan_to_table(laboratory: Path, run: Run, tmp_path: Path) 
     mean = summary[(summary["method"] == "field") & (summary["split"] == "test")]
     np.testing.assert_allclose(mean["mean_mm"], field["error_mm"].mean(), atol=1e-6)
     assert mean["seeds"].tolist() == [2]
-    states = {path: path.stat().st_mtime_ns for path in (tmp_path / "a sweep" / "units").glob("*_*.json")}
+    states = {path: path.stat().st_mtime_ns for path in (tmp_path / "a sweep" / "units").glob("one*.json")}
     assert run("rafl-sweep", "plan.yaml", "--out", "a sweep").returncode == 0
     assert {path: path.stat().st_mtime_ns for path in states} == states

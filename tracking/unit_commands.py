@@ -7,7 +7,7 @@ from typing import Any
 from rafl.batch.execute import end_of, execute
 from rafl.batch.options import Batch
 from rafl.batch.plain_command import plain_command
-from rafl.batch.state import Status
+from rafl.batch.state import UNITS_FOLDER, Status
 from rafl.batch.unit import create_unit
 from rafl.tracking import cli
 from rafl.tracking.commands import check_recordings, print_results, read_rig
@@ -16,8 +16,6 @@ from rafl.tracking.reconstruction.corrected_tracks import with_corrections
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
 from rafl.tracking.report import write_report
 from rafl.tracking.video.recordings import find_videos
-
-UNITS_FOLDER = "units"
 
 
 def track(given: Mapping[str, Any], how: Batch) -> None:

@@ -17,7 +17,7 @@ from rafl.common.errors import InputError
 from rafl.common.yaml_files import StrictModel
 
 STATE_FORMAT, LIST_FORMAT = "rafl-unit/1", "rafl-units/1"
-LIST_FILE = "units.json"
+UNITS_FOLDER, LIST_FILE = "units", "units.json"  # the folder lies beside the results of a command
 MAX_STATE_BYTES, MAX_LIST_BYTES = 10_000_000, 200_000_000  # they have some 1,000 bytes for a unit
 LOCK_TRIES, LOCK_PAUSE_S = 5, 0.02
 

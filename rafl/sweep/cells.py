@@ -1,4 +1,4 @@
-"""The units of a plan: a fit for every model, and an evaluation for every model and dataset, a cell of a matrix."""
+"""The units of a plan: a capture of every specimen, a fit of every model, an evaluation of every cell of a matrix."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,9 +7,22 @@ from pathlib import Path
 from rafl import cli
 from rafl.batch.plain_command import plain_command
 from rafl.batch.unit import Unit, create_unit
+from rafl.capture import cli as capture_cli
 from rafl.common.errors import InputError
 from rafl.common.names import check_name
-from rafl.sweep.plan import SEEDED, START, Plan, Variant, fit_options, training_sets, variants
+from rafl.sweep.files import PARTS, find_datasets, find_specimens
+from rafl.sweep.plan import (
+    LABEL,
+    SEEDED,
+    START,
+    Plan,
+    Value,
+    Variant,
+    capture_options,
+    fit_options,
+    training_sets,
+    variants,
+)
 
 
 @dataclass(frozen=True)
@@ -38,31 +51,40 @@ class Sweep:
     """The units of a plan.
 
     Attributes:
+        captures: units that build datasets.
         fits: units that fit models.
         cells: evaluations.
     """
 
+    captures: list[Unit]
     fits: list[Unit]
     cells: list[Cell]
 
     @property
     def units(self) -> list[Unit]:
-        """All units, fits first."""
-        return [*self.fits, *(cell.unit for cell in self.cells)]
+        """All units: captures, fits, evaluations."""
+        return [*self.captures, *self.fits, *(cell.unit for cell in self.cells)]
 
 
-def sweep_units(plan: Plan, source: Path, datasets: Mapping[str, str], out: Path) -> Sweep:
+def sweep_units(plan: Plan, source: Path, out: Path) -> Sweep:
     """The units of a plan.
 
     Args:
-        plan: what to fit and to evaluate.
+        plan: what to build, to fit and to evaluate.
         source: file of the plan; paths in it are relative to its folder.
-        datasets: files by name.
-        out: folder for runs and tables.
+        out: folder for datasets, runs and tables.
 
     Raises:
-        InputError: a name is too long for a file, or the number of folds is not possible.
+        InputError: a file is missing, a name is too long for a file or taken, or the number of folds is not possible.
     """
+    specimens, datasets = find_specimens(plan, source), find_datasets(plan, source)
+    if both := specimens.keys() & datasets.keys():
+        raise InputError(
+            f"{LABEL} {source}: expected one dataset of each name, found {min(both)!r:.80} twice; rename one"
+        )
+    captures = [_capture_unit(name, Path(folder), out, plan.capture) for name, folder in specimens.items()]
+    built = {name: str(_built_dataset(name, out)) for name in specimens}
+    datasets = {**built, **datasets}
     fits, cells = [], []
     chosen = variants(plan)
     labels = {variant.label: variant for variant in chosen}
@@ -80,7 +102,23 @@ def sweep_units(plan: Plan, source: Path, datasets: Mapping[str, str], out: Path
                     folder = out / "cells" / name / key
                     unit = _cell_unit(_checked(source, f"{name}_on_{key}"), folder, run, datasets[key])
                     cells.append(Cell(unit, folder, trained_on, variant.label, seed, key))
-    return Sweep(fits, cells)
+    return Sweep(captures, fits, cells)
+
+
+def _built_dataset(name: str, out: Path) -> Path:
+    """The dataset of a specimen's folder of this name."""
+    return out / "datasets" / f"{name}.h5"
+
+
+def _capture_unit(name: str, folder: Path, out: Path, options: Mapping[str, Value]) -> Unit:
+    known = capture_options()
+    path = _built_dataset(name, out)
+    specimen, recordings, tracks = (folder / part for part in PARTS)
+    values = {known[option][0]: value for option, value in options.items()}
+    own = {"specimen": specimen, "tracks": tracks, "recordings": recordings, "out": path}
+    command = plain_command("rafl-capture", capture_cli.capture, {**values, **own})
+    read = [specimen, recordings, *sorted(item for item in tracks.iterdir() if item.is_file())]
+    return create_unit(name, command, [path], read)
 
 
 def _fit_name(source: Path, trained_on: str, variant: Variant, seed: int | None) -> str:
@@ -92,9 +130,7 @@ def _checked(source: Path, name: str) -> str:
     try:
         return check_name(name)
     except ValueError as error:
-        raise InputError(
-            f"a plan of a sweep {source}: unit {name!r:.80}: {error}; give methods a shorter `name`"
-        ) from None
+        raise InputError(f"{LABEL} {source}: unit {name!r:.80}: {error}; give methods a shorter `name`") from None
 
 
 def _start(

@@ -9,15 +9,14 @@ from rich.table import Table
 
 from rafl.batch.execute import end_of, execute, show_status
 from rafl.batch.options import Batch
-from rafl.batch.state import Status, open_book
+from rafl.batch.state import UNITS_FOLDER, Status, open_book
 from rafl.common.command_line import create_table, one_line
 from rafl.common.files import written_files
 from rafl.common.text_tables import spreadsheet_text
 from rafl.sweep.cells import sweep_units
-from rafl.sweep.plan import find_datasets, read_plan
+from rafl.sweep.plan import read_plan
 from rafl.sweep.results import by_method, gather, summarise
 
-UNITS_FOLDER = "units"
 RESULTS_FILE, SUMMARY_FILE = "results.csv", "summary.csv"
 MOST_ROWS = 60  # printed; summary.csv has all
 
@@ -35,7 +34,7 @@ def sweep(source: Path, out: Path, batch: Batch) -> None:
         typer.Exit: some units failed; code 1.
     """
     plan = read_plan(source)
-    made = sweep_units(plan, source, find_datasets(plan, source), out)
+    made = sweep_units(plan, source, out)
     found = execute(made.units, out / UNITS_FOLDER, batch)
     if found is None:
         return

@@ -1,11 +1,10 @@
 """`plan.yaml`: what a sweep fits, and what it evaluates."""
 
-import glob
 import itertools
-import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from enum import Enum
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,6 +13,7 @@ from pydantic import Field, field_validator, model_validator
 from rafl import cli
 from rafl.batch.options import OWN
 from rafl.batch.plain_command import Parameter, parameters
+from rafl.capture import cli as capture_cli
 from rafl.common.errors import InputError
 from rafl.common.names import Name, check_names, check_visible
 from rafl.common.yaml_files import StrictModel, read_yaml
@@ -21,8 +21,11 @@ from rafl.common.yaml_files import StrictModel, read_yaml
 FORMAT = "rafl-sweep/1"
 LABEL = "a plan of a sweep"
 SEEDED = ("rafl", "srl")  # methods that start from random weights
-# Options of rafl-fit that the plan sets elsewhere, or that make no difference to a model.
-NOT_VARIED = ("method", "seed", "out", "resume", "each", "tensorboard")
+# Options that the plan sets elsewhere, or that make no difference to a dataset or a model.
+NOT_VARIED = (
+    *("method", "seed", "out", "resume", "each", "tensorboard"),
+    *("recordings", "update", "names", "inspect", "verify"),
+)
 START = "from"
 
 Value = bool | int | float | str
@@ -52,7 +55,8 @@ class Method(StrictModel):
     @field_validator("options")
     @classmethod
     def _check_options(cls, options: Values) -> Values:
-        return check_options(options)
+        check_options(options, "rafl-fit", fit_options())
+        return options
 
     @property
     def label(self) -> str:
@@ -65,6 +69,8 @@ class Plan(StrictModel):
 
     Attributes:
         datasets: files, or patterns such as `datasets/*.h5`, relative to the plan.
+        specimens: folders with specimen.yaml, recordings.csv and tracks/, or patterns, of which datasets are built.
+        capture: options of rafl-capture for them.
         methods: to fit.
         seeds: of methods that start from random weights; others are fitted once.
         options: of every method that does not set them itself.
@@ -74,7 +80,9 @@ class Plan(StrictModel):
     """
 
     format: str
-    datasets: tuple[str, ...] = Field(min_length=1)
+    datasets: tuple[str, ...] = ()
+    specimens: tuple[str, ...] = ()
+    capture: dict[str, Value] = Field(default_factory=dict)
     methods: tuple[Method, ...] = Field(min_length=1)
     seeds: tuple[int, ...] = Field((0,), min_length=1)
     options: Values = Field(default_factory=dict)
@@ -82,12 +90,18 @@ class Plan(StrictModel):
     folds: int | None = Field(None, ge=2)
     evaluate: Literal["own", "left-out", "all"] = "own"
 
-    @field_validator("datasets")
+    @field_validator("datasets", "specimens")
     @classmethod
-    def _check_datasets(cls, datasets: tuple[str, ...]) -> tuple[str, ...]:
-        for path in datasets:
+    def _check_paths(cls, paths: tuple[str, ...]) -> tuple[str, ...]:
+        for path in paths:
             check_visible(path)
-        return datasets
+        return paths
+
+    @field_validator("capture")
+    @classmethod
+    def _check_capture(cls, options: dict[str, Value]) -> dict[str, Value]:
+        check_options(options, "rafl-capture", capture_options())
+        return options
 
     @field_validator("methods", mode="before")
     @classmethod
@@ -115,10 +129,13 @@ class Plan(StrictModel):
     @field_validator("options")
     @classmethod
     def _check_options(cls, options: Values) -> Values:
-        return check_options(options)
+        check_options(options, "rafl-fit", fit_options())
+        return options
 
     @model_validator(mode="after")
     def _check_together(self) -> "Plan":
+        if not (self.datasets or self.specimens):
+            raise ValueError("datasets: expected at least one dataset, or `specimens`, found none")
         if self.folds is not None and self.train != "folds":
             raise ValueError(f"folds: expected `train: folds` beside it, found `train: {self.train}`")
         if self.evaluate == "left-out" and self.train == "all":
@@ -128,30 +145,39 @@ class Plan(StrictModel):
         return self
 
 
-def check_options(options: Values) -> Values:
-    """Check options against those of rafl-fit.
+Options = Mapping[str, tuple[str, Parameter]]  # name in Python and parameter, by the name without dashes
+
+
+def check_options(options: Mapping[str, Value | list[Value]], command: str, known: Options) -> None:
+    """Check options against those of a command.
 
     Raises:
-        ValueError: an unknown option, or a value that rafl-fit refuses. The message names it.
+        ValueError: an unknown option, or a value that the command refuses. The message names it.
     """
-    known = fit_options()
     for name, value in options.items():
         if name not in known:
-            raise ValueError(f"{name}: expected an option of rafl-fit ({', '.join(known)}), found {name!r:.80}")
+            raise ValueError(f"{name}: expected an option of {command} ({', '.join(known)}), found {name!r:.80}")
         values = value if isinstance(value, list) else [value]
         if not values:
             raise ValueError(f"{name}: expected a value, found an empty list")
         for each in values:
             _check_value(known[name][1], name, each)
-    return options
 
 
-def fit_options() -> dict[str, tuple[str, Parameter]]:
-    """Options of rafl-fit that a plan may set, with their names in Python, by their names without dashes."""
-    found = parameters(cli.fit)
+def fit_options() -> Options:
+    """Options of rafl-fit that a plan may set."""
+    return _options(cli.fit)
+
+
+def capture_options() -> Options:
+    """Options of rafl-capture that a plan may set."""
+    return _options(capture_cli.capture)
+
+
+def _options(command: Callable[..., None]) -> Options:
     return {
         item.option.removeprefix("--"): (name, item)
-        for name, item in found.items()
+        for name, item in parameters(command).items()
         if item.option and name not in (*NOT_VARIED, *OWN)
     }
 
@@ -166,8 +192,11 @@ def _check_value(option: Parameter, name: str, value: Value) -> None:
         raise ValueError(f"{name}: expected {expected}, found {value!r:.80}")
     if option.least is not None and isinstance(value, int | float) and value < option.least:
         raise ValueError(f"{name}: expected at least {option.least:g}, found {value:g}")
-    if name == "integrator" and value not in cli.INTEGRATORS:
-        raise ValueError(f"{name}: expected {' or '.join(cli.INTEGRATORS)}, found {value!r:.80}")
+    allowed = [str(item.value) for item in option.kind] if issubclass(option.kind, Enum) else []
+    if name == "integrator":
+        allowed = list(cli.INTEGRATORS)
+    if allowed and value not in allowed:
+        raise ValueError(f"{name}: expected {' or '.join(allowed)}, found {value!r:.80}")
 
 
 def read_plan(path: Path) -> Plan:
@@ -177,29 +206,6 @@ def read_plan(path: Path) -> Plan:
         InputError: as `rafl.common.yaml_files.read_yaml` says.
     """
     return read_yaml(path, Plan, LABEL, FORMAT)
-
-
-def find_datasets(plan: Plan, path: Path) -> dict[str, str]:
-    """The dataset files of a plan at `path`, by their names without ending.
-
-    Raises:
-        InputError: a file or pattern finds nothing, or two files share a name.
-    """
-    found: list[str] = []
-    for entry in plan.datasets:
-        pattern = str(path.parent / entry)
-        is_pattern = glob.has_magic(entry) and not os.path.exists(pattern)
-        matching = sorted(glob.glob(str(Path(glob.escape(str(path.parent))) / entry))) if is_pattern else [pattern]
-        files = [name for name in matching if os.path.isfile(name)]
-        if not files:
-            raise InputError(f"{LABEL} {path}: datasets: expected a dataset at {pattern}, found nothing; correct it")
-        found += [name for name in files if name not in found]
-    stems = [Path(name).stem for name in found]
-    try:
-        check_names(stems)
-    except ValueError as error:
-        raise InputError(f"{LABEL} {path}: datasets: {error}; rename one") from None
-    return dict(zip(stems, found, strict=True))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from rafl.batch.cluster import read_cluster
 from rafl.batch.plain_command import plain_command
 from rafl.common.errors import InputError
 from rafl.sweep.cells import Sweep, sweep_units
-from rafl.sweep.plan import find_datasets, fit_options, read_plan, variants
+from rafl.sweep.files import find_datasets
+from rafl.sweep.plan import fit_options, read_plan, variants
 
 Units = Callable[..., Sweep]
 
@@ -31,7 +32,7 @@ def sweep(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Units:
         path = Path("plan.yaml")
         path.write_text(head + text)
         plan = read_plan(path)
-        return sweep_units(plan, path, find_datasets(plan, path), Path("out"))
+        return sweep_units(plan, path, Path("out"))
 
     return units
 
@@ -100,9 +101,35 @@ def test_datasets_by_pattern_and_beside_the_plan(tmp_path: Path, monkeypatch: py
     assert list(find_datasets(plan, path)) == ["b", "-c", "a"]
     monkeypatch.chdir(folder)
     path = Path("plan.yaml")
-    datasets = find_datasets(read_plan(path), path)
-    made = sweep_units(plan, path, datasets, Path("out"))
+    made = sweep_units(plan, path, Path("out"))
     assert made.fits[1].command[:2] == ("rafl-fit", "./-c.h5")
+
+
+def test_datasets_of_specimens(sweep: Units, tmp_path: Path) -> None:
+    """Their folders are found by a pattern; fits wait for the datasets, and are captured again when tracks change."""
+    for name in ("s 1", "s 2"):
+        tracks = tmp_path / "lab" / name / "tracks"
+        tracks.mkdir(parents=True)
+        for path in (tracks / "load.h5", tracks.parent / "specimen.yaml", tracks.parent / "recordings.csv"):
+            path.touch()
+    made = sweep("specimens: ['lab/s *']\nmethods: [sysid]\ncapture: {tolerance-mm: 3, initial: rest}\n")
+    assert [unit.name for unit in made.captures] == ["s 1", "s 2"]
+    assert made.captures[0].line == (
+        "rafl-capture 'lab/s 1/specimen.yaml' 'lab/s 1/tracks' --recordings 'lab/s 1/recordings.csv' "
+        "--out 'out/datasets/s 1.h5' --tolerance-mm 3 --initial rest"
+    )
+    assert "lab/s 1/tracks/load.h5" in made.captures[0].inputs
+    assert len(made.fits) == 5
+    assert made.fits[0].inputs == made.captures[0].outputs
+    with pytest.raises(InputError, match=r"capture: initial: expected auto or rest.*found 'late'"):
+        sweep("specimens: ['lab/s *']\nmethods: [sysid]\ncapture: {initial: late}\n")
+    with pytest.raises(InputError, match="capture: out: expected an option of rafl-capture"):
+        sweep("specimens: ['lab/s *']\nmethods: [sysid]\ncapture: {out: x}\n")
+    (tmp_path / "lab" / "s 2" / "recordings.csv").unlink()
+    with pytest.raises(InputError, match=r"specimens: .*in lab/s 2, found no recordings\.csv"):
+        sweep("specimens: ['lab/s *']\nmethods: [sysid]\n")
+    with pytest.raises(InputError, match="specimens: expected the folder of a specimen"):
+        sweep("specimens: [lab/s9]\nmethods: [sysid]\n")
 
 
 @pytest.mark.parametrize(
@@ -144,7 +171,7 @@ def test_missing_datasets_are_named(sweep: Units) -> None:
     head = "format: rafl-sweep/1\nmethods: [sysid]\n"
     with pytest.raises(InputError, match=r"datasets: expected a dataset at no\*\.h5, found nothing"):
         sweep("datasets: ['no*.h5']\n", head)
-    with pytest.raises(InputError, match=r"datasets: .*at least 1"):
+    with pytest.raises(InputError, match=r"datasets: expected at least one dataset, or `specimens`"):
         sweep("datasets: []\n", head)
     Path("other").mkdir()
     Path("other/thick.h5").touch()
