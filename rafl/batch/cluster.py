@@ -43,6 +43,7 @@ class Cluster(StrictModel):
         memory_gb: of a task.
         at_once: tasks of an array that run at the same time.
         array_size: largest array that the cluster takes (MaxArraySize).
+        queued: tasks that are in the queue of the cluster at the same time.
         units_per_task: units that a task runs one after another.
         setup: lines of shell before each task, such as `module load python`.
         options: further options of sbatch, by name.
@@ -57,6 +58,7 @@ class Cluster(StrictModel):
     memory_gb: Annotated[float, Field(gt=0.0)] = 4.0
     at_once: Positive = 256
     array_size: Positive = 1000
+    queued: Positive = 1000
     units_per_task: Positive = 1
     setup: tuple[Line, ...] = ()
     options: dict[Line, OptionalLine | int | bool] = Field(default_factory=dict)
@@ -137,8 +139,10 @@ class ClusterExecutor:
         self.answered = time.monotonic()
 
     def free(self) -> int:
-        """Number of units that can be submitted now."""
-        return self.settings.array_size * self.settings.units_per_task
+        """Number of units that can be submitted now: none until half of a full queue has ended."""
+        own = self.settings
+        room = own.queued - len(set(self.jobs.values()))
+        return min(room, own.array_size) * own.units_per_task if 2 * room >= own.queued else 0
 
     def running(self) -> set[str]:
         """Names of the submitted units whose job is in the queue or runs."""

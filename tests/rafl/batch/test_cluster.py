@@ -76,6 +76,14 @@ def test_tasks_of_submitit_run_units(book: Book, make: Make, tmp_path: Path) -> 
     assert state.job
 
 
+def test_a_full_queue_is_filled_again_once_half_of_it_has_ended(book: Book) -> None:
+    executor = ClusterExecutor(book, Cluster(array_size=8, queued=10, units_per_task=3), "local")
+    assert executor.free() == 8 * 3
+    for tasks, free in ((2, 8 * 3), (4, 6 * 3), (5, 5 * 3), (6, 0), (10, 0)):
+        executor.jobs = {f"unit {number}": str(number // 3) for number in range(3 * tasks)}
+        assert executor.free() == free
+
+
 needs_slurm = [
     pytest.mark.slow,
     pytest.mark.skipif(bool(missing()) or os.geteuid() != 0, reason="no SLURM, or not root"),
