@@ -8,7 +8,8 @@ TAIL := $(SHARED)/reference/fishtail_fine_cells.npy
 export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install demo test test-slow fuzz lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
-	bench-simulator bench-tracking bench-paper bench-capture bench-places bench-sim2real bench-labs bench-laws bench-mesh bench-image laws clean
+	bench-simulator bench-tracking bench-paper bench-capture bench-places bench-sim2real bench-labs bench-laws bench-mesh \
+	bench-image bench-cluster laws clean
 
 install: $(VENV)/installed $(VENV)/kernels
 
@@ -140,6 +141,10 @@ bench-places: install
 bench-image: install
 	$(BIN)/python tests/bench/image_objective.py
 	$(BIN)/python tests/bench/image_intervals.py
+
+# Sixty small recordings by --on local and by SLURM with failures on the way (slurm-wlm and munge; root).
+bench-cluster: install
+	$(BIN)/python tests/bench/cluster.py
 
 clean:
 	rm -rf build $(VENV)

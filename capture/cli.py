@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from rafl.batch.options import Batch, ClusterOption, OnOption, PrintOption, StatusOption
 from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
@@ -241,11 +242,16 @@ def capture(
     ] = None,
     inspect: Annotated[Path | None, typer.Option(help="Only print the contents of a dataset.")] = None,
     verify: Annotated[Path | None, typer.Option(help="Only compare a dataset with its stored hashes.")] = None,
+    on: OnOption = None,
+    cluster: ClusterOption = None,
+    print_commands: PrintOption = False,
+    status: StatusOption = False,
 ) -> None:
     """Register recordings to the specimen, embed the markers in its mesh, and fit the first frame of each recording.
 
     Example: rafl-capture specimen.yaml tracks/ --recordings recordings.csv
     """
+    given = dict(locals())
     if inspect is not None or verify is not None:
         for path in (inspect, verify):
             if path is not None:
@@ -264,6 +270,12 @@ def capture(
     if out is not None and out.suffix != ".h5":
         raise InputError(f"--out: expected the name of a dataset that ends with .h5, found {out}")
     rest_frames = None if rest is None else _rest_frames(rest)
+    how = Batch.of(on, None, cluster, print_commands, status)
+    if how.apart:
+        from rafl.capture import unit_commands
+
+        unit_commands.capture(given, how)
+        return
     from rafl.capture import commands
 
     settings = commands.CaptureSettings(

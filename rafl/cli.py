@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from rafl.batch.options import Batch, ClusterOption, JobsOption, OnOption, PrintOption, StatusOption, Where
 from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
@@ -81,12 +82,23 @@ def fit(
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Also write the history for TensorBoard into the run folder.")
     ] = False,
-    resume: Annotated[bool, typer.Option(help="Continue an interrupted run.")] = False,
+    resume: Annotated[bool, typer.Option(help="Continue an interrupted run, or start it if there is none.")] = False,
+    each: Annotated[
+        bool, typer.Option("--each", help="Fit each dataset by itself, into runs in the folder --out [runs].")
+    ] = False,
+    on: OnOption = None,
+    jobs: JobsOption = None,
+    cluster: ClusterOption = None,
+    print_commands: PrintOption = False,
+    status: StatusOption = False,
 ) -> None:
     """Train on the `train` recordings, validate on the `val` recordings and keep the best model.
 
     Example: rafl-fit datasets/thick.h5 --out runs/thick
+
+    Example of several fits at the same time: rafl-fit datasets/*.h5 --each --jobs 2
     """
+    given = dict(locals())
     if method not in METHODS:
         raise InputError(f"--method: expected {', '.join(METHODS)}, found {method!r}")
     if integrator and integrator not in INTEGRATORS:
@@ -97,6 +109,12 @@ def fit(
         raise InputError("--frames: expected 0 (all) or at least 2, found 1")
     for path in datasets:
         require_file(path, DATASET)
+    how = Batch.of(Where.local if each and on is None else on, jobs, cluster, print_commands, status)
+    if how.apart:
+        from rafl import unit_commands
+
+        unit_commands.fit(given, how)
+        return
     from rafl import commands
 
     options = {
@@ -125,11 +143,20 @@ def evaluate(
         list[Path], typer.Argument(help="Run folders and dataset files (.h5).", metavar="RUN... DATASET...")
     ],
     out: Annotated[Path | None, typer.Option(help="Folder for errors.csv and report.html [the first run].")] = None,
+    report: Annotated[bool, typer.Option(help="Write evaluation.h5 and report.html.")] = True,
+    on: OnOption = None,
+    jobs: JobsOption = None,
+    cluster: ClusterOption = None,
+    print_commands: PrintOption = False,
+    status: StatusOption = False,
 ) -> None:
     """Compare the baseline simulator and fitted models with the recordings.
 
+    With --on, each dataset is a unit, with tables in OUT/DATASET. OUT/errors.csv and OUT/motions.csv join them.
+
     Example: rafl-eval runs/thick datasets/thick.h5 datasets/thin.h5
     """
+    given = dict(locals())
     runs = [path for path in paths if path.suffix != ".h5"]
     files = [path for path in paths if path.suffix == ".h5"]
     if not runs or not files:
@@ -142,6 +169,12 @@ def evaluate(
         require_file(run / "model.pt", "a fitted model (written by rafl-fit)")
     for file in files:
         require_file(file, DATASET)
+    how = Batch.of(on, jobs, cluster, print_commands, status)
+    if how.apart:
+        from rafl import unit_commands
+
+        unit_commands.evaluate(given, runs, files, out or runs[0], how)
+        return
     from rafl import commands
 
-    commands.evaluate(runs, files, out or runs[0])
+    commands.evaluate(runs, files, out or runs[0], report)

@@ -169,13 +169,14 @@ def _describe(model: FittedModel) -> str:
     return " on ".join(parts) + integration
 
 
-def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
+def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool) -> None:
     """Simulate every recording with the baseline simulator and every model; write tables and a report.
 
     Args:
         runs: run folders of the models.
         files: dataset files.
         folder: where errors.csv, motions.csv, errors.tex, evaluation.h5 and report.html are written.
+        report: whether evaluation.h5 and report.html are written.
 
     Raises:
         InputError: a run or a dataset cannot be read, or a model is applicable to none of the datasets.
@@ -196,14 +197,16 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
         "errors.csv": _spreadsheet(recordings),
         "motions.csv": _spreadsheet(motions),
         "errors.tex": latex_table(splits),
-        "report.html": page_file(PageData.of_evaluation(evaluation, f"Evaluation {folder.resolve().name}")),
     }
+    if report:
+        texts["report.html"] = page_file(PageData.of_evaluation(evaluation, f"Evaluation {folder.resolve().name}"))
     transfer = Transfer.of(splits)
     if transfer.errors.shape[1] > 1:
         errors = transfer.errors.rename(index=spreadsheet_text, columns=spreadsheet_text)
         texts["transfer.csv"] = errors.to_csv(float_format="%.6f")
     with written_files({folder / name: text for name, text in texts.items()}):
-        write_evaluation(folder / EVALUATION_FILE, evaluation)
+        if report:
+            write_evaluation(folder / EVALUATION_FILE, evaluation)
     Console(width=100).print(_error_table(splits))
     for sentence in beyond_training(comparisons, models):
         typer.echo(f"warning: {sentence}", err=True)
@@ -211,14 +214,15 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path) -> None:
         simulated = transfer.datasets_simulated[name]
         failing = f"; its simulation fails on {failed[name]} more" if name in failed else ""
         typer.echo(f"{name}: worse than the baseline simulator on {count} of {simulated} datasets{failing}")
-    typer.echo(f"wrote {folder}/errors.csv, motions.csv, errors.tex, {EVALUATION_FILE}")
+    typer.echo(f"wrote {folder}/errors.csv, motions.csv, errors.tex{f', {EVALUATION_FILE}' if report else ''}")
     held_out = held_out_errors(comparisons)
     if held_out:
         values = ", ".join(f"{name} {1e3 * error:.3f} mm" for name, error in held_out.items())
         typer.echo(f"held-out marker error: {values}")
     else:
         typer.echo("no recording has split `test`, so this error is not of held-out recordings", err=True)
-    typer.echo(f"report: {folder / 'report.html'} (open it in a browser; rafl-review {folder} shows all frames)")
+    if report:
+        typer.echo(f"report: {folder / 'report.html'} (open it in a browser; rafl-review {folder} shows all frames)")
 
 
 def _spreadsheet(table: pd.DataFrame) -> str:

@@ -207,6 +207,10 @@ def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Pat
         run("rafl-fit", "a.h5", "--out", "run", "--method", "rafl", "--epochs", "1"), "already holds a run", "--resume"
     )
     assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--epochs", "2", "--resume"), "the settings")
+    again = ("rafl-fit", "a.h5", "--out", "run", "--method", "rafl", "--epochs", "1", "--frames", "3", "--resume")
+    assert run(*again).returncode == 0
+    write_dataset(tmp_path / "a.h5", replace(built, recipe="another"))
+    assert_refused(run(*again), "run", "a.h5 has changed", "choose another --out")
     (tmp_path / "run" / "model.pt").write_bytes(b"x")
     assert_refused(run("rafl-eval", "run", "a.h5"), "model.pt", "cannot be read")
 

@@ -1,10 +1,12 @@
 """The commands `rafl-calibrate` and `rafl-track`: their options, and the checks that need no heavy import."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from rafl.batch.options import Batch, ClusterOption, OnOption, PrintOption, StatusOption, Where
 from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file, require_folder
@@ -142,6 +144,13 @@ def track(
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Recordings tracked at the same time [number of cores].")
     ] = None,
+    recording: Annotated[
+        list[str] | None, typer.Option(help="Only this recording, without a report; can be given several times.")
+    ] = None,
+    on: OnOption = None,
+    cluster: ClusterOption = None,
+    print_commands: PrintOption = False,
+    status: StatusOption = False,
 ) -> None:
     """Track the markers of every recording: find, follow and name them, and reconstruct their 3-D positions.
 
@@ -150,6 +159,7 @@ def track(
 
     Example: rafl-track videos/ --calib calib.yaml --specimen specimen.yaml
     """
+    given = dict(locals())
     exports = [kind.strip().lower() for kind in export.split(",") if kind.strip()]
     for kind in exports:
         if kind not in EXPORT_FORMATS:
@@ -159,6 +169,13 @@ def track(
     _check_calibration(calib)
     if specimen is not None:
         require_file(specimen, SPECIMEN_LABEL)
+    how = Batch.of(on, (jobs or os.cpu_count()) if on == Where.local else jobs, cluster, print_commands, status)
+    if how.apart:
+        from rafl.tracking import unit_commands
+
+        unit_commands.track(given, how)
+        return
     from rafl.tracking import commands
 
-    commands.track(videos, calib, calib_unit, specimen, out, fps, fill, sync, exports, overlay, jobs)
+    only = recording or []
+    commands.track(videos, calib, calib_unit, specimen, out, fps, fill, sync, exports, overlay, jobs, only)

@@ -3,7 +3,7 @@
 import os
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from concurrent.futures import CancelledError, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
@@ -23,7 +23,7 @@ from rafl.common.command_line import create_table, progress
 from rafl.common.errors import InputError
 from rafl.common.files import require_writable
 from rafl.common.kernels import announce_compilation
-from rafl.tracking.linking.layout import read_layout
+from rafl.tracking.linking.layout import MarkerLayout, read_layout
 from rafl.tracking.linking.naming import with_face_planes
 from rafl.tracking.overlay import write_overlay
 from rafl.tracking.pipeline import TrackingSettings, existing_tracks, track_recording
@@ -52,6 +52,7 @@ def track(
     exports: list[str],
     overlay: bool,
     jobs: int | None,
+    only: list[str],
 ) -> None:
     """Track every recording that has no tracks yet; write tracks, exports, overlays and a report.
 
@@ -69,23 +70,26 @@ def track(
         exports: keys of `WRITERS`.
         overlay: whether to write overlay videos.
         jobs: recordings tracked at the same time; None for the number of cores.
+        only: names of the recordings to track, without a report; empty for all.
 
     Raises:
-        InputError: a file cannot be read, or no recording could be tracked.
+        InputError: a file cannot be read, a name is of no recording, or no recording could be tracked.
         typer.Exit: some recordings could not be tracked; code 1.
     """
     announce_compilation()
     require_writable(out)
-    rig = read_any_calibration(calib, unit, partial(_announce_filmed, calib, videos))
     settings = TrackingSettings(read_layout(specimen) if specimen else None, fps, fill, sync)
     layout = settings.layout
-    rig = with_face_planes(rig, layout) if layout else rig
+    rig = read_rig(calib, unit, videos, layout)
     places = dict(zip(layout.names, layout.positions, strict=True)) if layout else {}
     found = find_videos(videos, rig, calib)
+    check_recordings(only, found)
     recordings: dict[str, dict[str, Video]] = {}
     done: dict[str, Tracks] = {}
     failed: dict[str, str] = {}
     for name, paths in found.items():
+        if only and name not in only:
+            continue
         try:
             recordings[name] = open_videos(paths, rig)
         except InputError as error:
@@ -120,10 +124,31 @@ def track(
     if not done:
         first = next(iter(failed))
         raise InputError(f"recording {first}: {failed[first]}")
-    write_report(out / "report.html", done, rig)
-    _print_results(out, done, failed, len(kept), specimen)
+    if not only:
+        write_report(out / "report.html", done, rig)
+    print_results(out, done, failed, len(kept), specimen, report=not only)
     if failed:
         raise typer.Exit(1)
+
+
+def check_recordings(only: Iterable[str], found: Mapping[str, object]) -> None:
+    """Check names that a user gives against the recordings that were found.
+
+    Raises:
+        InputError: there is no such recording.
+    """
+    if absent := set(only) - found.keys():
+        raise InputError(f"--recording: expected some of {', '.join(found)}, found {sorted(absent)[0]!r:.80}")
+
+
+def read_rig(calib: Path, unit: str | None, videos: Path, layout: MarkerLayout | None) -> Rig:
+    """The cameras of a calibration, with the faces that they film if a layout tells them; as in `track`.
+
+    Raises:
+        InputError: the calibration cannot be read.
+    """
+    rig = read_any_calibration(calib, unit, partial(_announce_filmed, calib, videos))
+    return with_face_planes(rig, layout) if layout else rig
 
 
 def _write_overlays(out: Path, name: str, videos: dict[str, Video], rig: Rig, tracks: Tracks, bar: Progress) -> None:
@@ -146,9 +171,19 @@ def _announce_filmed(calib: Path, videos: Path, count: int) -> dict[str, tuple[i
     return filmed
 
 
-def _print_results(
-    out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int, specimen: Path | None
+def print_results(
+    out: Path, done: dict[str, Tracks], failed: dict[str, str], kept: int, specimen: Path | None, report: bool = True
 ) -> None:
+    """Print a table of tracks, their notes, what failed, and what follows.
+
+    Args:
+        out: folder of the tracks.
+        done: tracks by recording.
+        failed: reasons by recording.
+        kept: number of recordings whose tracks were there before.
+        specimen: that named the markers; None for none.
+        report: whether report.html was written.
+    """
     Console(width=110).print(_summary_table(done))
     with_note: dict[str, list[str]] = {}
     for name, tracks in done.items():
@@ -160,7 +195,7 @@ def _print_results(
         typer.echo(f"error: recording {name}: {reason}", err=True)
     if kept:
         typer.echo(f"kept the tracks of {kept} recordings: nothing changed since they were tracked")
-    typer.echo(f"wrote {len(done) - kept} tracks files to {out}/; look at {out}/report.html")
+    typer.echo(f"wrote {len(done) - kept} tracks files to {out}/" + (f"; look at {out}/report.html" if report else ""))
     if specimen:
         typer.echo(f"next: rafl-capture {specimen} {out} --recordings recordings.csv")
     else:

@@ -3,10 +3,11 @@
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 from rafl.common.errors import InputError
-from rafl.common.files import new_folders
+from rafl.common.files import new_folders, sha256
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.data.objective import Objective
@@ -50,7 +51,7 @@ def fit(
             (residual acceleration field), `srl` (supervised baseline), `sysid` (E and nu), `sysid-e` (E at nu = 0.499),
             `sysid-damping` (E, nu and viscosity), `sysid-loss` (E, nu and loss factor) or `sysid-branches` (E, nu
             and Maxwell branches).
-        resume: continue the interrupted run in the folder; the settings must be the same.
+        resume: continue the interrupted run in the folder, if there is one; the settings must be the same.
         report: called with every row of the history.
         notify: called with a message for every setting that has no effect.
         epochs: maximum number of passes over the recordings; by method if None.
@@ -93,6 +94,7 @@ def fit(
         objective=objective,
         integrator=integrator,
         limit_energy=limit_energy,
+        sha256=tuple(map(sha256, paths)),
     )
     check_inputs(method, loaded, Path(start) if start else None, integrator)
     if process_count() > 1 and method != "rafl":
@@ -127,15 +129,27 @@ def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify:
 
 @contextmanager
 def open_run(run: Path, settings: Settings, resume: bool) -> Iterator[None]:
-    """Create a run folder, or reopen one to resume its run. Two runs never share a folder.
+    """Create a run folder, or reopen one to resume its run, if there is one. Two runs never share a folder.
 
     A new folder is removed if the run fails before it has saved anything to resume from.
 
     Raises:
-        InputError: the folder already holds a run or, when resuming, a run with other settings.
+        InputError: the folder already holds a run or, when resuming, a run with other settings or other datasets.
     """
-    if resume:
+    if resume and (run / SETTINGS_FILE).exists():
         earlier = read_settings(run)
+        if not earlier.sha256:  # of an earlier version
+            earlier = replace(earlier, sha256=settings.sha256)
+        changed = [
+            path
+            for path, *hashes in zip(earlier.datasets, earlier.sha256, settings.sha256, strict=False)
+            if len(set(hashes)) > 1
+        ]
+        if changed and earlier == replace(settings, sha256=earlier.sha256):
+            raise InputError(
+                f"expected the dataset that the run in {run} began with, found that {changed[0]} has changed; choose "
+                "another --out, or remove the folder to fit again"
+            )
         if earlier != settings:
             raise InputError(
                 f"expected the settings and datasets in {run}/config.yaml to resume, found others; use the same, or "

@@ -114,6 +114,7 @@ class Settings:
             where a dataset has them.
         integrator: time integration of the simulator; empty for that of `start` or else of the datasets.
         limit_energy: whether the energy that a field adds is limited, see `rafl.residual.energy_limit`.
+        sha256: of the dataset files, so that no run is resumed with others; empty in runs of earlier versions.
     """
 
     method: str
@@ -132,11 +133,13 @@ class Settings:
     objective: Objective = ""
     integrator: str = ""
     limit_energy: bool = True
+    sha256: tuple[str, ...] = ()
 
 
 def write_settings(run: Path, settings: Settings) -> None:
     """Write `config.yaml`."""
-    content = {"format": FORMAT, **asdict(settings), "datasets": list(settings.datasets)}
+    content = {"format": FORMAT, **asdict(settings)}
+    content |= {key: list(content[key]) for key in ("datasets", "sha256")}
     write_text(run / SETTINGS_FILE, yaml.safe_dump(content, sort_keys=False))
 
 

@@ -14,6 +14,8 @@ import trimesh
 import yaml
 from support import SMALL_SPECIMEN, draw_frame
 
+from rafl.batch.state import Book, State, Status
+from rafl.batch.unit import create_unit
 from rafl.calibration.camera import OrthographicCamera, Plane
 from rafl.calibration.rig import Rig, rig_text, write_calibration
 from rafl.capture.specimen.specimen import read_specimen
@@ -56,6 +58,20 @@ world:
 moved:
 - {from: left/00.png, to: left/01.png, along: [0, -1, 0]}
 """
+PLAN = """format: rafl-sweep/1
+datasets: [data.h5]
+methods: [sysid-e, {method: rafl, name: field, options: {epochs: [1, 2], learning-rate: 1e-3, by-sigma: true}}]
+seeds: [0, 1]
+options: {frames: 4}
+evaluate: all
+"""
+CLUSTER = """format: rafl-cluster/1
+partition: short
+minutes: 30
+memory_gb: 2.5
+setup: [module load python]
+options: {nice: 10}
+"""
 
 
 def make_laboratory(folder: Path) -> None:
@@ -69,9 +85,31 @@ def make_laboratory(folder: Path) -> None:
     (folder / "body.yaml").write_text(
         SPECIMEN.replace("{box_mm: [60, 20, 20], element_mm: 10}", "{surface: body.stl, element_mm: 10}")
     )
+    (folder / "plan.yaml").write_text(PLAN)
+    (folder / "cluster.yaml").write_text(CLUSTER)
+    _write_units(folder)
     _write_motions(folder)
     _write_video(folder)
     _write_foreign(folder)
+
+
+def _write_units(folder: Path) -> None:
+    """A list of two units, of which one has failed."""
+    units = [create_unit(name, ["rafl-fit", "data.h5"], [f"{name}.pt"], ["data.h5"]) for name in ("one", "two")]
+    book = Book(folder / "sweep" / "units", Path("."))
+    book.write_units(units)
+    state = State(
+        status=Status.failed,
+        command=units[0].command,
+        inputs={"data.h5": (10, 20)},
+        attempts=2,
+        host="node1",
+        job="12_3",
+        started=datetime(2026, 1, 2, tzinfo=UTC),
+        seconds=2.5,
+        reason="expected more, found less",
+    )
+    book.write_state("one", state)
 
 
 def _write_foreign(folder: Path) -> None:

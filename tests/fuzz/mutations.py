@@ -378,6 +378,7 @@ BY_SUFFIX: dict[str, dict[str, Mutation]] = {
     ".yaml": {**BYTES, **TEXT, "tree": edit_yaml, "tree again": edit_yaml, "bomb": yaml_bomb},
     ".csv": {**BYTES, **TEXT, "number again": replace_number, "word again": replace_word},
     ".trc": {**BYTES, **TEXT},
+    ".json": {**BYTES, **TEXT},
     ".h5": {
         **BYTES,
         **{

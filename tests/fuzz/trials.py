@@ -20,6 +20,7 @@ from mutations import BY_SUFFIX, pick
 from support import error_lines
 from typer.testing import CliRunner
 
+from rafl.batch.cluster import read_cluster
 from rafl.calibration.board import read_board
 from rafl.calibration.detection.image_file import read_grey_image
 from rafl.calibration.foreign.read import read_any_calibration
@@ -34,10 +35,17 @@ from rafl.evaluation.evaluation_file import EVALUATION_FILE, read_evaluation
 from rafl.evaluation.page_data import PageData
 from rafl.evaluation.page_file import page_file
 from rafl.fitting.run_folder import load_model
+from rafl.sweep.cli import sweep_app
 from rafl.tracking.cli import track_app
 from rafl.tracking.reconstruction.tracks import read_tracks
 
-APPS = {"rafl-capture": capture_app, "rafl-fit": fit_app, "rafl-eval": eval_app, "rafl-track": track_app}
+APPS = {
+    "rafl-capture": capture_app,
+    "rafl-fit": fit_app,
+    "rafl-eval": eval_app,
+    "rafl-sweep": sweep_app,
+    "rafl-track": track_app,
+}
 
 
 def read_foreign(path: Path) -> Rig:
@@ -54,6 +62,7 @@ def page_of_evaluation(path: Path) -> str:
 READERS: dict[str, Callable[[Path], object]] = {
     "read_specimen": read_specimen,
     "read_board": read_board,
+    "read_cluster": read_cluster,
     "read_marker_names": read_marker_names,
     "load_model": load_model,
     "page_of_evaluation": page_of_evaluation,
@@ -88,6 +97,10 @@ TARGETS: dict[str, tuple[str, tuple[str, ...]]] = {
     "evaluation": ("run/evaluation.h5", ("page_of_evaluation", "run/evaluation.h5")),
     "settings": ("run/config.yaml", ("rafl-fit", "data.h5", *FIT, "run", "--resume")),
     "checkpoint": ("run/checkpoint.pt", ("rafl-fit", "data.h5", *FIT, "run", "--resume")),
+    "plan": ("plan.yaml", ("rafl-sweep", "plan.yaml", "--out", "out", "--print-commands")),
+    "cluster": ("cluster.yaml", ("read_cluster", "cluster.yaml")),
+    "units": ("sweep/units/units.json", ("rafl-sweep", "sweep", "--status")),
+    "state of a unit": ("sweep/units/one.json", ("rafl-sweep", "sweep", "--status")),
     "calibration": ("calib.yaml", ("rafl-track", "videos", "--calib", "calib.yaml", "--specimen", "dots.yaml")),
     "aniposelib": ("stereo.toml", ("read_foreign", "stereo.toml")),
     "OpenCV": ("left.yml", ("read_foreign", "left.yml")),

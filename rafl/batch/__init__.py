@@ -1,0 +1,1 @@
+"""Independent commands, called units, run on this machine or on a cluster, once each, and resumed."""
