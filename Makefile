@@ -37,7 +37,7 @@ demo: install
 test: install lint docs
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
-# Long runs: 10,000 time steps, oscillations of 10 s.
+# Long runs: 10,000 time steps, oscillations of 10 s, whole sweeps, fits of the real beam.
 test-slow: install
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -m slow -n 2 --dist worksteal
 

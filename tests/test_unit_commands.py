@@ -57,6 +57,7 @@ def test_track_makes_the_files_of_the_plain_command(laboratory: Path, run: Run, 
     assert_refused(run(*command, "--recording", "take 3"), "--recording", "take 1, take 2", "'take 3'")
 
 
+@pytest.mark.slow
 def test_capture_fit_and_eval_as_units(laboratory: Path, run: Run, tmp_path: Path) -> None:
     table = laboratory / "recordings.csv"
     built = run(
@@ -81,6 +82,7 @@ def test_capture_fit_and_eval_as_units(laboratory: Path, run: Run, tmp_path: Pat
     assert not list((tmp_path / "errors").rglob("report.html"))
 
 
+@pytest.mark.slow
 def test_a_sweep_from_plan_to_table(laboratory: Path, run: Run, tmp_path: Path) -> None:
     own = tmp_path / "specimens" / "one"
     shutil.copytree(laboratory / "tracks", own / "tracks")

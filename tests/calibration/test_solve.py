@@ -82,6 +82,7 @@ def test_views_without_noise_give_the_exact_camera(random: np.random.Generator) 
     np.testing.assert_allclose(found.plane.normal, [0, 1, 0], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_covariance_predicts_the_errors() -> None:
     """Over 30 noisy calibrations, the RMS of error / predicted sigma is 1 within 25 %."""
     camera = side_camera()

@@ -42,6 +42,7 @@ def test_recordings_that_are_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_more_than_255_points(run: Run, tmp_path: Path) -> None:
     folder = CASES / "c3d-more-than-255-points"
     capture(run, folder / "in", folder / "recordings.csv")

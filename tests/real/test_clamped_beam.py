@@ -16,6 +16,7 @@ pytestmark = [
 ]
 
 
+@pytest.mark.slow
 def test_identified_material_reduces_the_error_on_the_held_out_recording(run: Run, tmp_path: Path) -> None:
     table = SPECIMENS / "clamped_beam_recordings.csv"
     capture = ("rafl-capture", SPECIMENS / "clamped_beam.yaml", FOLDER, "--recordings", table)

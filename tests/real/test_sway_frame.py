@@ -78,7 +78,7 @@ class OccludedVideo:
             yield Frame(number / 22.7, image)
 
 
-@pytest.mark.parametrize("downwards", [False, True])
+@pytest.mark.parametrize("downwards", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_passing_bar_does_not_change_identities(downwards: bool) -> None:
     """The bar occludes two of seven columns or one of four rows at a time; partly occluded dots get a larger sigma."""
     unoccluded = follow(OccludedVideo(), lambda: None)
@@ -98,6 +98,7 @@ def test_passing_bar_does_not_change_identities(downwards: bool) -> None:
     assert np.isfinite(error[~occluded]).mean() > 0.995
 
 
+@pytest.mark.slow
 def test_sigma_covers_the_compression_error(tmp_path: Path) -> None:
     """Encoded again with H.264, the positions deviate from the earlier ones by as much as sigma states."""
     original = follow(OccludedVideo(), lambda: None)

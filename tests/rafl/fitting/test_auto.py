@@ -88,6 +88,7 @@ def test_default_fit_predicts_left_out_recordings(rubber: Dataset, tmp_path: Pat
     assert again == model
 
 
+@pytest.mark.slow
 def test_left_out_errors_are_those_of_fits_without_the_recordings(rubber: Dataset, tmp_path: Path) -> None:
     quantities = METHOD_QUANTITIES["sysid-loss"]
     names = rubber.split("train")

@@ -24,6 +24,7 @@ def weights(run: Path) -> torch.Tensor:
     return torch.cat([value.reshape(-1) for value in field.state_dict().values()])
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this torch has no distributed training")
 def test_torchrun_equals_one_process(dataset: Dataset, tmp_path: Path) -> None:
     write_dataset(tmp_path / "a.h5", dataset)

@@ -168,6 +168,7 @@ def test_a_greater_bit_depth_reduces_the_error() -> None:
     assert fine.sigma[0, 0] <= coarse.sigma[0, 0]
 
 
+@pytest.mark.slow
 def test_compiled_and_cached_kernels_give_the_same_bits(tmp_path: Path) -> None:
     """Dots of low contrast on mottled skin: the fits depend on the last bit."""
     skin = draw_frame([(60.0 + 30 * k, 50.0, 6.0, 6.0, 0.0) for k in range(6)], (260, 100), noise=2.0, contrast=60.0)
