@@ -189,6 +189,7 @@ class _Training:
         start, full_length = _start_and_datasets(datasets, settings)
         datasets = [limit_frames(dataset, settings.frames) for dataset in full_length]
         self.items, self.validation = training_items(datasets), validation_batches(datasets)
+        self.training = batches_by_dataset(self.items, settings)
         self.history: list[dict[str, float]] = []
         torch.manual_seed(settings.seed)
         self.field = ResidualField() if start.field is None else start.field
@@ -302,7 +303,7 @@ class _Training:
         mean, failures = torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
         reason = f"a simulation of {', '.join(item.name for item in batch)} failed in epoch {len(self.history)}"
         try:
-            for recordings in batches_by_dataset(self.group.share(batch), self.settings):
+            for recordings in self._recordings(self.group.share(batch)):
                 force = self.field.on(recordings.dataset.simulator, torch.float32)
                 simulated, forces = recordings.simulate(force)
                 loss = training_loss(recordings, simulated, forces, self.settings.force_penalty)
@@ -321,6 +322,16 @@ class _Training:
             raise SimulationError(f"{reason}; lower the learning rate")
         self.optimiser.step()
         return mean.item()
+
+    def _recordings(self, items: list[Item]) -> list[Recordings]:
+        """One batch for each dataset that has some of the items, no longer than the longest of them."""
+        result = []
+        for whole in self.training:
+            names = [item.name for item in items if item.dataset is whole.dataset]
+            if names:
+                longest = max(len(whole.dataset.trajectories[name].time) for name in names)
+                result.append(whole.select([whole.names.index(name) for name in names]).first_frames(longest))
+        return result
 
     def _restore_best(self) -> None:
         """Return to the best field so far, halve the learning rate and clear Adam's moments."""
