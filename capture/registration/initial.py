@@ -137,8 +137,8 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     else:
         least, little, more = LOCAL_FORCE_SIGMAS
         # The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose
-        # would: the two can hardly be told apart.
-        with_modulus = not with_pose
+        # would: the two can hardly be told apart. So would positions in a plane that is assumed, not measured.
+        with_modulus = not with_pose and (frame.axes is not None or bool(frame.observed_axes.all()))
         first = _LevenbergMarquardt(frame, with_pose, least, 0.0, with_modulus).minimise(zero, pose or IDENTITY, None)
         sigma = frame.sigma[frame.measured][frame.observed_axes]
         model_sigma = np.sqrt(max(_rms(frame, first.residual) ** 2 - float((sigma**2).mean()), 0.0))
