@@ -19,7 +19,7 @@ from rafl.common.errors import InputError, SimulationError
 from rafl.common.files import require_writable, written_files
 from rafl.common.kernels import announce_compilation
 from rafl.common.names import require_names
-from rafl.common.text_tables import spreadsheet_text
+from rafl.common.text_tables import spreadsheet_csv, spreadsheet_text
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.evaluation.evaluation_file import EVALUATION_FILE, Evaluation, write_evaluation
@@ -194,8 +194,8 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool) ->
     recordings, splits, motions = error_table(comparisons), split_table(comparisons), motion_table(comparisons)
     evaluation = Evaluation(comparisons, "; ".join(f"{name}: {_describe(model)}" for name, model in models.items()))
     texts = {
-        "errors.csv": _spreadsheet(recordings),
-        "motions.csv": _spreadsheet(motions),
+        "errors.csv": spreadsheet_csv(recordings),
+        "motions.csv": spreadsheet_csv(motions),
         "errors.tex": latex_table(splits),
     }
     if report:
@@ -223,13 +223,6 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool) ->
         typer.echo("no recording has split `test`, so this error is not of held-out recordings", err=True)
     if report:
         typer.echo(f"report: {folder / 'report.html'} (open it in a browser; rafl-review {folder} shows all frames)")
-
-
-def _spreadsheet(table: pd.DataFrame) -> str:
-    """A table as CSV; no name in it is a formula."""
-    names = table.select_dtypes(exclude="number")
-    safe = table.assign(**{key: names[key].map(spreadsheet_text) for key in names})
-    return str(safe.to_csv(index=False, float_format="%.6f"))
 
 
 def _error_table(splits: pd.DataFrame) -> Table:

@@ -15,7 +15,8 @@ from rafl.capture.dataset.registered import Registered, find_dataset_places
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
-from rafl.capture.registration.initial import FirstFrame, InitialState, fit_first_frame, fit_velocity
+from rafl.capture.registration.first_frame import FirstFrame
+from rafl.capture.registration.initial import InitialState, fit_first_frame, fit_velocity
 from rafl.capture.registration.motion_start import MotionStart
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import (

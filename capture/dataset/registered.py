@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
-from rafl.capture.registration.initial import FirstFrame
+from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.motion_start import MotionStart, find_motion_start
 from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.recording import Recording

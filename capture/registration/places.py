@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.initial import (
     MODULUS_SIGMA,
-    FirstFrame,
     LinearFit,
     fit_linear_forces,
     linear_jacobian,

@@ -9,7 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rafl.capture.registration.initial import FirstFrame, InitialState
+from rafl.capture.registration.first_frame import FirstFrame
+from rafl.capture.registration.initial import InitialState
 from rafl.capture.registration.rigid import IDENTITY
 from rafl.simulation.rollout import Start, rollout
 

@@ -2,8 +2,12 @@
 
 import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rafl.common.errors import InputError
+
+if TYPE_CHECKING:  # the import takes a second, which commands that refuse their options need not wait for
+    import pandas as pd
 
 SEPARATORS = ",;\t"
 FORMULA_STARTS = ("=", "+", "-", "@")
@@ -31,6 +35,13 @@ def read_table_text(path: Path) -> tuple[str, str, int]:
 def spreadsheet_text(text: str) -> str:
     """A cell's text that no spreadsheet takes for a formula: one that begins like a formula gets an apostrophe."""
     return f"'{text}" if text.startswith(FORMULA_STARTS) else text
+
+
+def spreadsheet_csv(table: "pd.DataFrame") -> str:
+    """A table as CSV with six decimals; no name in it is a formula."""
+    names = table.select_dtypes(exclude="number")
+    safe = table.assign(**{key: names[key].map(spreadsheet_text) for key in names})
+    return str(safe.to_csv(index=False, float_format="%.6f"))
 
 
 def cell_text(text: str) -> str:

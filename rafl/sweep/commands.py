@@ -12,7 +12,7 @@ from rafl.batch.options import Batch
 from rafl.batch.state import UNITS_FOLDER, Status, open_book
 from rafl.common.command_line import create_table, one_line
 from rafl.common.files import written_files
-from rafl.common.text_tables import spreadsheet_text
+from rafl.common.text_tables import spreadsheet_csv
 from rafl.sweep.cells import sweep_units
 from rafl.sweep.plan import read_plan
 from rafl.sweep.results import by_method, gather, summarise
@@ -41,18 +41,12 @@ def sweep(source: Path, out: Path, batch: Batch) -> None:
     errors = gather(cell for cell in made.cells if found.status[cell.unit.name] == Status.done)
     summary = summarise(errors)
     tables = {RESULTS_FILE: errors, SUMMARY_FILE: summary}
-    with written_files({out / name: _csv(table) for name, table in tables.items()}):
+    with written_files({out / name: spreadsheet_csv(table) for name, table in tables.items()}):
         pass
     if len(summary):
         Console(width=120).print(_printed(summary))
     typer.echo(f"wrote {out / RESULTS_FILE} and {out / SUMMARY_FILE}")
     end_of(found, out / UNITS_FOLDER)
-
-
-def _csv(table: pd.DataFrame) -> str:
-    names = table.select_dtypes(exclude="number")
-    safe = table.assign(**{key: names[key].map(spreadsheet_text) for key in names})
-    return str(safe.to_csv(index=False, float_format="%.6f"))
 
 
 def _printed(summary: pd.DataFrame) -> Table:

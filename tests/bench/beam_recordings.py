@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import read_recording_rows
-from rafl.capture.registration.initial import FirstFrame, fit_first_frame, fit_velocity
+from rafl.capture.registration.first_frame import FirstFrame
+from rafl.capture.registration.initial import fit_first_frame, fit_velocity
 from rafl.capture.registration.registration import RestPose, combined_layout, fit_rest
 from rafl.capture.registration.rigid import RigidTransform
 from rafl.capture.specimen.specimen import Specimen

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from rich.console import Console
 
-from rafl.capture.registration.initial import FirstFrame, fit_first_frame
+from rafl.capture.registration.first_frame import FirstFrame
+from rafl.capture.registration.initial import fit_first_frame
 from rafl.capture.registration.sequence import ITERATIONS, fit_by_sequence
 from rafl.capture.specimen.specimen import read_specimen
 from rafl.common.command_line import create_table

@@ -23,7 +23,10 @@ from rafl.review.tracks.recordings import Library
 from rafl.tracking.reconstruction.tracks import write_tracks
 
 PORT, TOKEN = 4321, "token-of-the-tests"
-OPTIONS = "--no-sandbox --disable-gpu --disable-background-networking --disable-component-update --disable-sync"
+OPTIONS = (
+    "--no-sandbox --disable-gpu --use-angle=swiftshader --enable-unsafe-swiftshader --disable-background-networking "
+    "--disable-component-update --disable-sync --no-first-run"
+)
 
 
 @pytest.fixture(scope="session")
@@ -60,7 +63,7 @@ def browser() -> Iterator[Browser]:
     if executable is None:
         pytest.skip("no chromium is installed: apt-get install chromium")
     with sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=executable, args=[*OPTIONS.split(), "--no-first-run"])
+        found = playwright.chromium.launch(executable_path=executable, args=OPTIONS.split())
         yield found
         found.close()
 

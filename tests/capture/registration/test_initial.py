@@ -3,7 +3,8 @@ import pytest
 import torch
 from support import ROOT
 
-from rafl.capture.registration.initial import FirstFrame, fit_first_frame
+from rafl.capture.registration.first_frame import FirstFrame
+from rafl.capture.registration.initial import fit_first_frame
 from rafl.capture.registration.sequence import fit_by_sequence
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 from rafl.data.synthetic import load_force, loaded_equilibria, twisted_shapes

@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from rafl.capture.registration.initial import FirstFrame
+from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.registration import fit_pose_near_clamp
 from rafl.capture.registration.rigid import IDENTITY
