@@ -137,10 +137,11 @@ bench-capture: install
 bench-places: install
 	$(BIN)/python tests/bench/places.py
 
-# One camera or two, compared in the image plane and in space; 95 % intervals from pixels.
+# One camera or two, compared in the image plane and in space; 95 % intervals from pixels; cameras that were touched.
 bench-image: install
 	$(BIN)/python tests/bench/image_objective.py
 	$(BIN)/python tests/bench/image_intervals.py
+	$(BIN)/python tests/bench/moved_cameras.py
 
 # Sixty small recordings by --on local and by SLURM with failures on the way (slurm-wlm and munge; root).
 bench-cluster: install

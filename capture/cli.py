@@ -219,6 +219,12 @@ def capture(
         str | None,
         typer.Option(help="Recording of the undeformed specimen: RECORDING, or RECORDING:FIRST-LAST (frames)."),
     ] = None,
+    refine_cameras: Annotated[
+        bool,
+        typer.Option(
+            "--refine-cameras", help="Find how cameras moved, and how late their clocks are, since their calibration."
+        ),
+    ] = False,
     moving_clamp: Annotated[bool, typer.Option(help="Follow the clamp's markers, if there are any.")] = True,
     start: Annotated[
         int | None, typer.Option(min=0, help="First frame of the motion [found from the motion of each recording].")
@@ -288,6 +294,7 @@ def capture(
         initial.value,
         forces.value,
         unit and unit.value,
+        refine_cameras,
         {} if names is None else commands.read_marker_names(names),
     )
     commands.capture(specimen, tracks, recordings, out, update, settings)

@@ -13,7 +13,7 @@ from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.naming import read_marker_names as read_marker_names
 from rafl.capture.dataset.settings import CaptureSettings as CaptureSettings
 from rafl.capture.dataset.sources import read_recording
-from rafl.capture.dataset.summary import print_contents, recordings_table, warnings
+from rafl.capture.dataset.summary import cameras_table, print_contents, recordings_table, warnings
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
 from rafl.capture.description.describe import MEASURED_SIGMA, describe
 from rafl.capture.description.specimen_files import (
@@ -244,7 +244,10 @@ def capture(
     report = path.with_suffix(".html")
     with written_files({report: dataset_page(described, dataset)}):
         (update_dataset if update else write_dataset)(path, dataset)
-    Console(width=130).print(recordings_table(dataset))
+    console = Console(width=130)
+    console.print(recordings_table(dataset))
+    if cameras := cameras_table(dataset):
+        console.print(cameras)
     for line in warnings(dataset):
         typer.echo(f"warning: {line}", err=True)
     typer.echo(f"wrote {path} and {report}")

@@ -4,6 +4,7 @@ import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 
+from rafl.capture.dataset.camera_summary import camera_rows
 from rafl.capture.dataset.summary import warnings
 from rafl.capture.specimen.specimen import Specimen
 from rafl.data.dataset import Dataset
@@ -33,6 +34,14 @@ frame. First frame fit: root mean square distance between the markers of the fit
 <th>found from</th><th>state</th><th>frames averaged</th><th>registered by</th><th>registration [mm]</th>
 <th>first frame fit [mm]</th></tr>
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
+{% if cameras %}<h2>Cameras</h2>
+<p class="note">How each camera was found to have moved since its calibration, and how late its clock is: turned about
+the middle of the markers and shifted, along x, y and z of the specimen; what to add to its
+<code>time_offset_s</code>; and how far the pixels of the markers are from where the calibration has them.</p>
+<table><tr><th>camera</th><th>turned [degrees]</th><th>shifted [mm]</th><th>clock [frames]</th><th>pixels [px]</th></tr>
+{% for row in cameras %}<tr><td>{{ row.camera }}</td><td>{{ row.turn }}</td><td>{{ row.shift }}</td>
+<td>{{ row.clock }}</td>
+<td{% if row.touched %} class="worse"{% endif %}>{{ row.pixels }}</td></tr>{% endfor %}</table>{% endif %}
 <h2>Young's modulus</h2>
 <p class="note">Each recording shows it twice: by the bend under the load that was released, and by the frequency of the
 swing. The two depend on different quantities: the load, or the frame rate and the density. Both take Poisson's ratio
@@ -73,6 +82,7 @@ def dataset_page(specimen: Specimen, dataset: Dataset) -> str:
         .render(
             name=dataset.name,
             warnings=warnings(dataset),
+            cameras=camera_rows(dataset),
             mesh=f"{len(mesh.vertices)} vertices, {len(mesh.hexes)} elements, {len(dataset.simulator.fixed)} fixed "
             f"vertices. The elements have {filled:.1%} of the volume of the shape.",
             mesh_image=draw_specimens(mesh, [("at rest", mesh.vertices, dataset.markers.rest)]),

@@ -1,6 +1,6 @@
 """Building of datasets: registers recordings to a specimen and fits their first frames."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,12 +9,15 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rafl.capture.dataset.camera_summary import change_attributes
 from rafl.capture.dataset.modulus import estimate_modulus
 from rafl.capture.dataset.naming import in_layout_order
+from rafl.capture.dataset.refine_cameras import refine_cameras
 from rafl.capture.dataset.registered import Registered, find_dataset_places
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
+from rafl.capture.registration.camera_change import CameraChange
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.initial import InitialState, fit_first_frame, fit_velocity
 from rafl.capture.registration.motion_start import MotionStart
@@ -37,6 +40,9 @@ Array = NDArray[Any]
 
 VELOCITY_WINDOW_FRAMES = 5  # the polynomial through all of them gives the velocity in the first frame
 SAME_PLACE = 1e-9  # [m]
+# First frames follow the cameras not quite linearly. They are fitted again until the cameras change by less than a
+# share of their standard deviations.
+MAX_REFINEMENTS, SETTLED = 4, 0.3
 
 
 def build_dataset(
@@ -87,18 +93,44 @@ def build_dataset(
         recording = recordings[row.recording]
         registration = register(recording, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
         registered.append(Registered.of(specimen, recording, row, registration, settings))
-    markers, registered = find_dataset_places(empty, specimen, registered, known, settings)
-    empty = replace(empty, markers=markers)
-    trajectories = {}
-    for item in registered:
-        trajectories[item.row.recording] = _with_modulus(_trajectory(empty, specimen, item, settings), empty, specimen)
-        tick()
-    dataset = Dataset(specimen.name, simulator, markers, trajectories, recipe)
+    dataset, changed = _with_recordings(empty, specimen, registered, known, settings, tick)
+    changes: dict[str, CameraChange] = {}
+    for _ in range(MAX_REFINEMENTS if settings.refine_cameras else 0):
+        found = refine_cameras(dataset, specimen, registered, changes, settings.forces == "surface")
+        changes = found.changes
+        changed = [item.with_changes(changes) for item in registered]
+        dataset, changed = _with_recordings(empty, specimen, changed, known, settings, lambda: None)
+        if found.moved < SETTLED:
+            break
+    trajectories = {
+        item.row.recording: _with_attributes(
+            dataset.trajectories[item.row.recording], change_attributes(changes, item, dataset.markers.rest)
+        )
+        for item in registered
+    }
+    dataset = replace(dataset, trajectories=trajectories)
     try:
         dataset.check()
     except ValueError as error:
         raise InputError(f"the dataset from {folder} would be invalid: {error}; correct the recording") from None
     return dataset
+
+
+def _with_recordings(
+    empty: Dataset,
+    specimen: Specimen,
+    registered: list[Registered],
+    known: Markers | None,
+    settings: CaptureSettings,
+    tick: Callable[[], None],
+) -> tuple[Dataset, list[Registered]]:
+    """The dataset with markers at their places and with recordings whose first frames are fitted; the latter."""
+    markers, registered = find_dataset_places(empty, specimen, registered, known, settings)
+    empty, trajectories = replace(empty, markers=markers), {}
+    for item in registered:
+        trajectories[item.row.recording] = _with_modulus(_trajectory(empty, specimen, item, settings), empty, specimen)
+        tick()
+    return replace(empty, trajectories=trajectories), registered
 
 
 def _common_time_step(recordings: dict[str, Recording]) -> float:
@@ -191,7 +223,11 @@ def _with_modulus(item: Trajectory, dataset: Dataset, specimen: Specimen) -> Tra
     load = 1e-3 * float(str(item.attributes["load_g"])) if hung else 0.0
     found = estimate_modulus(dataset.simulator, dataset.markers, item, specimen.loaded, load)
     measured = {"bend_modulus": found.bend, "swing_modulus": found.swing, "swing_hz": found.frequency}
-    return replace(item, attributes=item.attributes | measured)
+    return _with_attributes(item, measured)
+
+
+def _with_attributes(item: Trajectory, more: Mapping[str, object]) -> Trajectory:
+    return replace(item, attributes={**item.attributes, **more})
 
 
 def _fit_initial_state(

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
+from rafl.capture.registration.camera_change import CameraChange, positions_at
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.motion_start import MotionStart, find_motion_start
 from rafl.capture.registration.places import Places, find_places
@@ -73,6 +74,14 @@ class Registered:
         views = _in_frame(views, registration.pose)
         return cls(recording, row, registration, position, sigma, start, last, views)
 
+    def with_changes(self, changes: dict[str, CameraChange]) -> "Registered":
+        """The recording as its cameras saw it from where they are now, at their own times."""
+        if not self.views:
+            return self
+        views = {name: changes[name].applied(view) if name in changes else view for name, view in self.views.items()}
+        position, sigma = positions_at(views, self.recording.time)
+        return replace(self, views=views, position=position, sigma=sigma)
+
     def with_pose(self, places: Places) -> "Registered":
         """The recording in the specimen frame, after its pose was found; sigma then contains that of the pose."""
         registration = replace(
@@ -91,7 +100,7 @@ class Registered:
 
     def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
         """Mean marker positions at rest before the release, or those of the first frame."""
-        rest = slice(self.start.rest_start, max(self.start.frame, self.start.rest_start + 1))
+        rest = self.start.rest_frames
         target, sigma = average_frames(self.position[rest], self.sigma[rest])
         name, axes = self.row.recording, None
         if self.views:

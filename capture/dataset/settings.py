@@ -21,6 +21,8 @@ class CaptureSettings:
             recording shows; `sequence`: as `rest`, fitted by a sequence of forces over time.
         forces: virtual forces act on the `tip` or on the whole `surface`.
         unit: of positions in tables that do not name it: m, cm or mm.
+        refine_cameras: find from the recordings how the cameras moved, and how late their clocks are, since their
+            calibration.
         names: of markers in the specimen, by their names in the files, where they differ.
     """
 
@@ -33,4 +35,5 @@ class CaptureSettings:
     initial: Literal["auto", "rest", "moving", "sequence"] = "auto"
     forces: Literal["tip", "surface"] = "tip"
     unit: str | None = None
+    refine_cameras: bool = False
     names: dict[str, str] = field(default_factory=dict)

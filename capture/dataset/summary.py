@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from rafl.capture.dataset.camera_summary import camera_rows, camera_warnings
 from rafl.capture.dataset.contradictions import contradictions
 from rafl.common.command_line import create_table
 from rafl.data.dataset import Dataset
@@ -42,6 +43,15 @@ def recordings_table(dataset: Dataset) -> Table:
             _number(values.get("fit_residual_mm"), ".3f"),
         )
     return table
+
+
+def cameras_table(dataset: Dataset) -> Table | None:
+    """Table of the cameras that were found elsewhere than calibrated; None without any."""
+    rows = camera_rows(dataset)
+    table = create_table("camera", "turned [degrees]", "shifted [mm]", "clock [frames]", "pixels [px]")
+    for row in rows:
+        table.add_row(row.camera, row.turn, row.shift, row.clock, row.pixels)
+    return table if rows else None
 
 
 def _number(value: object, format_spec: str) -> str:
@@ -79,7 +89,7 @@ def warnings(dataset: Dataset) -> list[str]:
                 f"{start - not_free} to {start - 1} (a hand, a slack string, or a load that touches again); it starts "
                 f"after them"
             )
-    return lines + contradictions(dataset)
+    return lines + camera_warnings(dataset) + contradictions(dataset)
 
 
 def _frame_through_model(recordings: list[dict[str, Any]]) -> str:
@@ -135,6 +145,8 @@ def print_contents(path: Path, console: Console) -> None:
     for key, text in lines.items():
         console.print(Text.assemble((key, "bold"), f": {text}"))
     console.print(recordings_table(dataset))
+    if cameras := cameras_table(dataset):
+        console.print(cameras)
     for name, item in dataset.trajectories.items():
         values = item.attributes
         line = (

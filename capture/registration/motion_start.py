@@ -29,6 +29,11 @@ class MotionStart:
     source: str
     not_free: int = 0
 
+    @property
+    def rest_frames(self) -> slice:
+        """Frames at rest before the motion; the first one of the motion if there are none."""
+        return slice(self.rest_start, max(self.frame, self.rest_start + 1))
+
 
 def find_motion_start(position: Array, initial: Literal["auto", "rest", "moving"], given: int | None) -> MotionStart:
     """Find the first frame of the free motion and whether the specimen moves in it.

@@ -9,6 +9,7 @@ Compared in space, a marker that one camera sees lies in the plane of the undefo
 
 import argparse
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from rafl.fitting.methods import METHODS
 from rafl.fitting.run_folder import Settings
 from rafl.simulation.simulator import Simulator
 from rafl.tracking.linking.layout import MarkerLayout
+from rafl.tracking.reconstruction.gap_filling import MEASURED, MISSING
 from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
 
@@ -61,6 +63,14 @@ RIGS = {
 }
 
 
+def front_specimen() -> Specimen:
+    """The canonical beam with the markers of one side only, at exact places."""
+    whole = read_specimen(SPECIMEN)
+    front = whole.layout.positions[:, 1] == 0.0
+    names = tuple(name for name, own in zip(whole.layout.names, front, strict=True) if own)
+    return replace(whole, layout=MarkerLayout(names, whole.layout.positions[front], 0.0))
+
+
 def held_twist(simulator: Simulator, specimen: Specimen, angles: np.ndarray) -> np.ndarray:
     """Equilibria [m], (B, N, 3), of which a hand holds the tip turned about x by angles (B) [rad]."""
     held = replace(simulator, fixed=np.union1d(simulator.fixed, specimen.loaded))
@@ -86,16 +96,25 @@ def motions(specimen: Specimen, frames: int) -> dict[str, np.ndarray]:
 
 
 def write_recordings(
-    folder: Path, specimen: Specimen, motion: np.ndarray, cameras: dict[str, Camera], with_pixels: bool, seed: int
+    folder: Path,
+    specimen: Specimen,
+    motion: np.ndarray,
+    cameras: dict[str, Camera],
+    with_pixels: bool,
+    seed: int,
+    film: Callable[[str, np.ndarray], np.ndarray] | None = None,
 ) -> list[RecordingRow]:
-    """Write the tracks of two recordings; those without pixels are what positions alone tell."""
+    """Write the tracks of two recordings; those without pixels are what positions alone tell.
+
+    film: exact pixels of a camera from exact positions (T, M, 3) [m]; those of the calibrated cameras if None.
+    """
     markers, random, rig = specimen.markers(1e-6), np.random.default_rng(seed), Rig(dict(cameras))
     rows = []
     for b, (name, split) in enumerate((("a", "train"), ("b", "test"))):
         exact = markers.positions(torch.from_numpy(motion[:, b])).numpy()
         pixels = {}
         for key, own in cameras.items():
-            pixel = own.project(exact)
+            pixel = own.project(exact) if film is None else film(key, exact)
             pixel = pixel + random.normal(0.0, SIGMA_PX, pixel.shape)
             pixels[key] = CameraPixels(pixel, np.full_like(pixel, SIGMA_PX))
         position, sigma, residual = triangulate(rig, pixels)
@@ -105,7 +124,7 @@ def write_recordings(
             time=np.arange(frames) / FPS,
             position=position,
             sigma=sigma,
-            state=np.ones(position.shape[:2], np.uint8),
+            state=np.where(np.isfinite(position[..., 0]), MEASURED, MISSING).astype(np.uint8),
             pixel={key: item.pixel for key, item in pixels.items()},
             residual=residual,
             pixel_sigma={key: item.sigma for key, item in pixels.items()},
@@ -146,10 +165,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the pixels' errors [0]")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    whole = read_specimen(SPECIMEN)
-    front = whole.layout.positions[:, 1] == 0.0
-    names = tuple(name for name, own in zip(whole.layout.names, front, strict=True) if own)
-    specimen = replace(whole, layout=MarkerLayout(names, whole.layout.positions[front], 0.0))
+    specimen = front_specimen()
     table = create_table("release", "cameras", "compared", "first frame [mm]", "free run [mm]", "E / true")
     for kind, motion in motions(specimen, options.frames).items():
         for rig, cameras in RIGS.items():

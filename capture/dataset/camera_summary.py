@@ -1,0 +1,104 @@
+"""What is said about cameras that were found elsewhere than their calibration has them."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rafl.calibration.camera import Camera
+from rafl.calibration.uncertainty import calibration_sigma
+from rafl.capture.dataset.registered import Registered
+from rafl.capture.registration.camera_change import CLOCK, CameraChange
+from rafl.data.dataset import Dataset
+
+Array = NDArray[Any]
+
+PREFIX = "camera_change_"  # of the names of attributes
+MAX_SIGMAS = 3.0  # a larger change is more than the calibration's uncertainty
+
+
+@dataclass(frozen=True)
+class CameraRow:
+    """One camera's change in words.
+
+    Attributes:
+        camera: its name.
+        turn, shift, clock: with their standard deviations, in degrees, mm and frames.
+        pixels: root mean square change of the markers' pixels at rest, and the calibration's own uncertainty of them.
+        touched: whether the change is more than the calibration's uncertainty.
+    """
+
+    camera: str
+    turn: str
+    shift: str
+    clock: str
+    pixels: str
+    touched: bool
+
+
+def change_attributes(changes: dict[str, CameraChange], item: Registered, rest: Array) -> dict[str, Array]:
+    """Attributes of a recording that hold the changes of its cameras; see `datasets/README.md`.
+
+    Args:
+        changes: by camera.
+        item: the recording, with its cameras as calibrated.
+        rest: places of the markers at rest [m], (M, 3).
+    """
+    pose = item.registration.pose
+    result = {}
+    for name, change in changes.items():
+        if name not in item.views:
+            continue
+        camera, calibrated = item.views[name].camera, item.recording.views[name].camera
+        moved, sigma = _pixel_change(change, camera, rest)
+        own = calibration_sigma(calibrated, (rest - pose.translation) @ pose.rotation)
+        sigmas = np.sqrt(np.diag(change.covariance))
+        result[PREFIX + name] = np.concatenate([change.value, sigmas, [moved, sigma, own]])
+    return result
+
+
+def _pixel_change(change: CameraChange, camera: Camera, points: Array) -> tuple[float, float]:
+    """Root mean square change of a coordinate of the pixels, and its standard deviation [px]."""
+    now = change.moved(camera)
+    slope = change.pose_slope(now, points)
+    variance = np.einsum("...k,kl,...l->...", slope, change.covariance[:CLOCK, :CLOCK], slope)
+    return float(np.sqrt(((now.project(points) - camera.project(points)) ** 2).mean())), float(np.sqrt(variance.mean()))
+
+
+def camera_rows(dataset: Dataset) -> list[CameraRow]:
+    """The changes of the cameras of a dataset; those of its latest recording if they differ."""
+    found: dict[str, object] = {}
+    for item in dataset.trajectories.values():
+        found |= {key.removeprefix(PREFIX): value for key, value in item.attributes.items() if key.startswith(PREFIX)}
+    rows = []
+    for name, numbers in found.items():
+        value, sigma, (moved, moved_sigma, own) = np.split(np.asarray(numbers, dtype=float), [CLOCK + 1, 2 * CLOCK + 2])
+        frames = 1.0 / dataset.simulator.time_step
+        known = "" if np.isnan(own) else f" (calibration +- {own:.2g})"
+        rows.append(
+            CameraRow(
+                name,
+                _pairs(np.degrees(value[:3]), np.degrees(sigma[:3])),
+                _pairs(1e3 * value[3:CLOCK], 1e3 * sigma[3:CLOCK]),
+                _pairs(frames * value[CLOCK:], frames * sigma[CLOCK:]),
+                f"{moved:.3g} +- {moved_sigma:.2g}{known}",
+                bool(moved > MAX_SIGMAS * np.hypot(moved_sigma, np.nan_to_num(own))),
+            )
+        )
+    return rows
+
+
+def _pairs(values: Array, sigmas: Array) -> str:
+    return ", ".join(f"{value:+.3f} +- {sigma:.2g}" for value, sigma in zip(values, sigmas, strict=True))
+
+
+def camera_warnings(dataset: Dataset) -> list[str]:
+    """A line for every camera whose change is more than its calibration's uncertainty."""
+    return [
+        f"camera {row.camera}: the markers' pixels are {row.pixels} px from where its calibration has them; it was "
+        "touched since, or the body is not as the model has it. The dataset has the camera where it was found; "
+        "calibrate again before the next recording"
+        for row in camera_rows(dataset)
+        if row.touched
+    ]

@@ -1,0 +1,350 @@
+"""Where the cameras are and how late their clocks are, found from the recordings by the simulated motion.
+
+A camera that was touched after its calibration sees the body turned against its clamp and against gravity. A clock
+that is late shows all its frames late. The simulated motion, the markers' places and the material are found with them.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from rafl.capture.dataset.registered import Registered
+from rafl.capture.registration.camera_change import CLOCK, CameraChange
+from rafl.capture.registration.first_frame import FirstFrame, linear_modes
+from rafl.capture.registration.initial import MODULUS_SIGMA
+from rafl.capture.specimen.specimen import Specimen
+from rafl.common.errors import InputError, SimulationError
+from rafl.data.dataset import Dataset, Trajectory
+from rafl.data.objective import CameraTerm, Recordings
+from rafl.data.views import at_lags, project, project_slope
+from rafl.fitting.gauss_newton import bounded_step
+from rafl.fitting.quantities import METHOD_QUANTITIES, MODULUS, material_values
+from rafl.simulation.rollout import rollout
+
+Array = NDArray[Any]
+
+# Prior standard deviations. A tripod that is touched turns by some tenths of a degree; a calibration's own errors are
+# smaller. The release is known to the nearest frame.
+TURN_SIGMA, SHIFT_SIGMA = np.radians(0.5), 1e-3  # [rad], [m]
+CLOCK_SIGMA, RELEASE_SIGMA = 0.5, 0.3  # [frames]
+REFERENCE_SIGMA = 1e-6  # of the first camera's clock, which the others' are told against [frames]
+LEAST_PLACE_SIGMA = 1e-7  # of a place that is exactly known [m]
+QUANTITIES = METHOD_QUANTITIES["sysid-loss"]
+RECORDINGS = 3  # from the largest to the least motion; more hardly tell more
+FRAME_SHARES = 0.4, 1.0  # a search over many oscillations starts near its end
+ITERATIONS, HALVINGS = 8, 5
+SETTLED = 0.05  # a step of fewer standard deviations ends the search
+MATERIAL_STEP = 1e-4  # of a variable, for differences
+FIRST_FRAME_STEP = 1e-6  # root mean square motion of the nodes, for differences [m]
+TIME_STEP = 1e-2  # [frames]
+FARTHEST = 100.0  # prior standard deviations that a variable may deviate by
+MAX_LIKENESS = 0.98  # correlation between frames; a larger one is that of few frames
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """Changes of the cameras.
+
+    Attributes:
+        changes: by camera.
+        moved: largest change of this search over its standard deviation.
+    """
+
+    changes: dict[str, CameraChange]
+    moved: float
+
+
+def refine_cameras(
+    dataset: Dataset,
+    specimen: Specimen,
+    registered: list[Registered],
+    before: dict[str, CameraChange],
+    whole_surface: bool,
+) -> Refinement:
+    """Find the cameras' changes from the training recordings that start at rest.
+
+    Gauss-Newton minimises the squared differences of the simulated and the measured pixels, robust by Huber's loss, and
+    the squared deviations from the priors. Its variables are E, nu and the loss factor, the poses and clocks of the
+    cameras, the first frame and the time of release of every recording, and the places of the markers. The squared
+    differences are relative to their mean, times (1 + r) / (1 - r) with their correlation r between frames: errors of
+    the model last, and tell less than their number.
+
+    Args:
+        dataset: built with the cameras as changed before.
+        specimen: its description.
+        registered: recordings of the dataset, with their cameras as calibrated.
+        before: changes so far, by camera; empty at first.
+        whole_surface: whether virtual forces act on the whole surface.
+
+    Raises:
+        InputError: no training recording in a known frame has pixels and starts at rest.
+        SimulationError: a simulation failed.
+    """
+    usable = [item for item in registered if item.row.split == "train" and item.views and not item.start.moving]
+    usable = [item for item in usable if not item.registration.pose_from_model]
+    if not usable:
+        raise InputError(
+            "--refine-cameras: expected a training recording that starts at rest in the specimen's frame, with the "
+            "pixels of its cameras, found none; leave the option out"
+        )
+    motion = Recordings.of(dataset, [item.row.recording for item in usable]).square_motion
+    ranks = np.round(np.linspace(len(usable) - 1, 0, min(RECORDINGS, len(usable)))).astype(int)
+    chosen = [usable[k] for k in np.argsort(motion)[ranks]]
+    search = _Search(dataset, specimen, chosen, before, whole_surface)
+    x = search.begin
+    for share in FRAME_SHARES:
+        x, covariance = search.minimise(x, share)
+    return search.refinement(x, covariance)
+
+
+class _Search:
+    """The search for all variables, in units of the standard deviations of their priors.
+
+    They are those of the material, of every camera (7), of every recording (its release and D of its first frame), and
+    of the places (3 M).
+    """
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        specimen: Specimen,
+        chosen: list[Registered],
+        before: dict[str, CameraChange],
+        whole_surface: bool,
+    ) -> None:
+        self.dataset, markers = dataset, dataset.markers
+        self.recordings = Recordings.of(dataset, [item.row.recording for item in chosen], objective="image")
+        still = {name: _at_rest(term, name, chosen) for name, term in self.recordings.terms.items()}
+        self.recordings = replace(self.recordings, terms=still)
+        self.cameras = list(still)
+        self.calibrated = [
+            [(item.views.get(name) or next(iter(item.views.values()))).camera for item in chosen]
+            for name in self.cameras
+        ]
+        self.centre = markers.rest.mean(axis=0)
+        self.step = dataset.simulator.time_step
+        frames = [item.first_frame(dataset, specimen, whole_surface) for item in chosen]
+        self.start = np.stack([_start_directions(frame, dataset.trajectories[frame.recording]) for frame in frames])
+        moved = np.sqrt((self.start**2).sum(-1).mean(axis=(0, 2)))  # [m] per unit of a direction, (D)
+        self.first_steps = FIRST_FRAME_STEP / moved
+        first_sigma = np.concatenate([np.repeat(frames[0].linear_force_sigma(), 3), [MODULUS_SIGMA]])
+        count, cameras, recordings = len(markers.names), len(self.cameras), len(chosen)
+        sizes = [len(QUANTITIES), *[7] * cameras, recordings, *[len(first_sigma)] * recordings, 3 * count]
+        ends = np.cumsum(sizes)
+        parts = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
+        self.material, self.poses, self.releases = parts[0], parts[1 : 1 + cameras], parts[1 + cameras]
+        self.first_frames, self.places = parts[2 + cameras : -1], parts[-1]
+        one = np.array([TURN_SIGMA] * 3 + [SHIFT_SIGMA] * 3 + [CLOCK_SIGMA * self.step])
+        poses = np.tile(one, (cameras, 1))
+        poses[0, CLOCK] = REFERENCE_SIGMA * self.step
+        places = np.maximum(np.broadcast_to(specimen.layout.sigma, count), LEAST_PLACE_SIGMA)
+        self.scale = np.concatenate(
+            [
+                [quantity.deviation for quantity in QUANTITIES],
+                poses.ravel(),
+                np.full(recordings, RELEASE_SIGMA * self.step),
+                np.tile(first_sigma, recordings),
+                np.repeat(places, 3),
+            ]
+        )
+        self.built = {name: before[name].value if name in before else np.zeros(7) for name in self.cameras}
+        start, mean = np.zeros((2, ends[-1]))
+        start[self.material] = mean[self.material] = self._assumed(chosen)
+        for name, own in zip(self.cameras, self.poses, strict=True):
+            start[own] = self.built[name]
+        mean[self.places] = 0.0 if markers.moved is None else -markers.moved.ravel()
+        self.begin, self.mean = start / self.scale, mean / self.scale
+        self.low, self.high = np.full((2, len(start)), [[-FARTHEST], [FARTHEST]])
+        for k, quantity in enumerate(QUANTITIES):
+            self.low[k], self.high[k] = np.array(quantity.bounds) / quantity.deviation
+
+    def _assumed(self, chosen: list[Registered]) -> Array:
+        """Variables of the material: E as the swings show it, the others as assumed."""
+        assumed = self.dataset.simulator.material
+        recordings = [self.dataset.trajectories[item.row.recording] for item in chosen]
+        swings = np.array([float(str(item.attributes["swing_modulus"])) for item in recordings])
+        values = [max(float(getattr(assumed, q.name, 0.0)), q.low, q.start) for q in QUANTITIES]
+        if np.isfinite(swings).any():
+            values[QUANTITIES.index(MODULUS)] = float(np.nanmedian(swings))
+        return np.array([np.clip(q.variable(v), *q.bounds) for q, v in zip(QUANTITIES, values, strict=True)])
+
+    def minimise(self, x: Array, share: float) -> tuple[Array, Array]:
+        """Variables that minimise the objective over a share of the frames, from x (n), and their covariance (n, n)."""
+        recordings = self.recordings.first_frames(max(round(share * len(self.recordings.markers)), 2))
+        for _ in range(ITERATIONS):
+            found = self._linearised(recordings, x)
+            step = bounded_step(found.normal, found.gradient + x - self.mean, self.low - x, self.high - x)
+            covariance = np.linalg.inv(found.normal)
+            if np.abs(step / np.sqrt(np.diag(covariance))).max() < SETTLED:
+                break
+            least = self._objective(recordings, x, found.variance)
+            for _ in range(HALVINGS):
+                if self._objective(recordings, x + step, found.variance) < least:
+                    break
+                step *= 0.5
+            x = x + step
+        return x, covariance
+
+    def refinement(self, x: Array, covariance: Array) -> Refinement:
+        """The changes of the cameras at variables x."""
+        changes, moved = {}, 0.0
+        for name, own in zip(self.cameras, self.poses, strict=True):
+            scale = self.scale[own]
+            sigma = scale[:, None] * covariance[own, own] * scale
+            changes[name] = CameraChange(x[own] * scale, self.centre, sigma)
+            moved = max(moved, float((np.abs(x[own] * scale - self.built[name]) / np.sqrt(np.diag(sigma))).max()))
+        return Refinement(changes, moved)
+
+    def _simulated(self, recordings: Recordings, sets: Array) -> tuple[Tensor, Tensor]:
+        """Markers (T, S, R, M, 3) [m] of sets of variables (S, n) at their places as built, and node positions."""
+        values, few = sets * self.scale, len(recordings.names)
+        amplitudes = np.stack([values[:, own] for own in self.first_frames], axis=1)  # (S, R, D)
+        start = self.dataset.start(recordings.names * len(sets))
+        moved = torch.from_numpy(np.einsum("srd,rdni->srni", amplitudes, self.start).reshape(start.q.shape))
+        variables = torch.from_numpy(np.repeat(values[:, self.material], few, axis=0))
+        material = material_values({q.name: q.value(variables[:, k]) for k, q in enumerate(QUANTITIES)})
+        simulator, frames = self.dataset.simulator, len(recordings.markers)
+        with torch.no_grad():
+            start = replace(start, q=start.q + moved)
+            positions, _ = rollout(simulator, start, frames - 1, parameters=simulator.parameters(**material))
+            markers = self.dataset.markers.positions(positions)
+        return markers.reshape(frames, len(sets), few, *markers.shape[2:]), positions[:, :few]
+
+    def _changes(self, x: Array) -> list[CameraChange]:
+        """Changes of the cameras at x."""
+        return [CameraChange((x * self.scale)[own], self.centre) for own in self.poses]
+
+    def _terms(self, recordings: Recordings, x: Array) -> list[CameraTerm]:
+        """What the cameras measured, as seen with their changes at x and the times of release."""
+        late, result = torch.from_numpy((x * self.scale)[self.releases]), []
+        for name, change, cameras in zip(self.cameras, self._changes(x), self.calibrated, strict=True):
+            term, later = recordings.terms[name], change.value[CLOCK] - self.built[name][CLOCK]
+            lag = term.lag - (later + late) / self.step
+            lag[0] = 0.0  # at rest
+            result.append(replace(term, cameras=[change.moved(camera) for camera in cameras], lag=lag))
+        return result
+
+    def _place_gain(self, q: Tensor) -> Tensor:
+        """Derivatives of the markers by their places at rest, (T, R, M, 3, 3)."""
+        markers, rest = self.dataset.markers, torch.from_numpy(self.dataset.simulator.mesh.vertices)
+        gain: Tensor = markers.axes(q) @ torch.linalg.inv(markers.axes(rest))
+        return gain
+
+    def _placed(self, markers: Tensor, gain: Tensor, x: Array) -> Tensor:
+        """Markers (T, R, M, 3) [m] at their changed places."""
+        moved = torch.from_numpy((x * self.scale)[self.places].reshape(-1, 3, 1))
+        return markers + (gain @ moved)[..., 0]
+
+    def _objective(self, recordings: Recordings, x: Array, variance: float) -> float:
+        """Squared differences under Huber's loss over their variance, and squared deviations from the priors."""
+        try:
+            markers, q = self._simulated(recordings, x[None])
+        except SimulationError:
+            return np.inf
+        placed = self._placed(markers[:, 0], self._place_gain(q), x)
+        total, limit = 0.0, recordings.limit[None, :, None]
+        for term in self._terms(recordings, x):
+            square = (term.root @ term.gap(placed)[..., None])[..., 0].square().sum(-1)
+            total += float(torch.where(square > limit, 2.0 * (limit * square).sqrt() - limit, square).sum())
+        return total / variance + float(((x - self.mean) ** 2).sum())
+
+    def _linearised(self, recordings: Recordings, x: Array) -> "_Linearised":
+        """Whitened differences of the pixels and their derivatives at x."""
+        material, first = len(QUANTITIES), self.start.shape[1]
+        columns = np.stack([np.arange(own.start, own.stop) for own in self.first_frames])  # (R, D)
+        sets = np.tile(x, (1 + material + first, 1))
+        sets[1 : 1 + material, :material] += np.diag(MATERIAL_STEP / self.scale[self.material])
+        for own in columns:
+            sets[1 + material + np.arange(first), own] += self.first_steps / self.scale[own]
+        simulated, q = self._simulated(recordings, sets)
+        steps = torch.from_numpy(np.concatenate([np.full(material, MATERIAL_STEP), self.first_steps]))
+        change = (simulated[:, 1:] - simulated[:, :1]) / steps[:, None, None, None]
+        gain = self._place_gain(q)
+        placed = self._placed(simulated[:, 0], gain, x)
+        residuals, jacobians = [], []
+        terms = zip(self._terms(recordings, x), self._changes(x), self.poses, strict=True)
+        for term, camera_change, own_pose in terms:
+            points = at_lags(placed, term.lag)
+            residual = (term.root @ (project(points, term.cameras) - term.pixel)[..., None])[..., 0]
+            size = residual.norm(dim=-1, keepdim=True).clamp_min(1e-300)
+            weight = (recordings.limit.sqrt()[None, :, None, None] / size).clamp_max(1.0).sqrt()
+            root = weight[..., None] * term.root
+            slope = root @ project_slope(points, term.cameras)  # (T, R, M, 2, 3)
+            jacobian = torch.zeros((*residual.shape, len(x)), dtype=torch.float64)
+            for k in range(material + first):
+                by_start = (slope @ at_lags(change[:, k], term.lag)[..., None])[..., 0]
+                if k < material:
+                    jacobian[..., k] = by_start
+                for r, own in enumerate(columns if k >= material else ()):
+                    jacobian[:, r, :, :, own[k - material]] = by_start[:, r]
+            by_pose = [camera_change.pose_slope(c, points[:, b].numpy()) for b, c in enumerate(term.cameras)]
+            jacobian[..., own_pose.start : own_pose.start + CLOCK] = root @ torch.from_numpy(np.stack(by_pose, axis=1))
+            later, earlier = (at_lags(placed, term.lag + step) for step in (TIME_STEP, -TIME_STEP))
+            velocity = (later - earlier) / (2.0 * TIME_STEP * self.step)
+            by_time = -(slope @ velocity[..., None])[..., 0]
+            by_time[0] = 0.0  # at rest
+            jacobian[..., own_pose.start + CLOCK] = by_time
+            for r in range(len(recordings.names)):
+                jacobian[:, r, :, :, self.releases.start + r] = by_time[:, r]
+            by_place = slope @ gain
+            for m in range(residual.shape[2]):
+                place = self.places.start + 3 * m
+                jacobian[:, :, m, :, place : place + 3] = by_place[:, :, m]
+            residuals.append(weight * residual)
+            jacobians.append(jacobian * torch.from_numpy(self.scale))
+        return _Linearised.of(torch.cat(residuals, dim=2), torch.cat(jacobians, dim=2))
+
+
+def _at_rest(term: CameraTerm, name: str, chosen: list[Registered]) -> CameraTerm:
+    """A camera's measurements of R recordings, of which the first row is the mean over the frames at rest."""
+    pixel, root = term.pixel.clone(), term.root.clone()
+    for r, item in enumerate(chosen):
+        if name not in item.views:
+            continue
+        own = item.views[name].pixel[item.start.rest_frames]
+        count = np.isfinite(own).all(-1).sum(0)  # (M)
+        both = torch.from_numpy(count) * term.seen[0, r] > 0  # (M)
+        mean = np.nansum(own, axis=0) / np.maximum(count, 1)[:, None]
+        pixel[0, r] = torch.where(both[:, None], torch.from_numpy(mean), pixel[0, r])
+        root[0, r] *= torch.from_numpy(np.sqrt(np.maximum(count, 1.0)))[:, None, None]
+    return replace(term, pixel=pixel, root=root)
+
+
+def _start_directions(frame: FirstFrame, item: Trajectory) -> Array:
+    """Derivatives of a first frame's node positions, (D, N, 3): by forces linear over their nodes [N], and by log E."""
+    modes = np.kron(linear_modes(frame.simulator.mesh.vertices[frame.nodes]), np.eye(3))
+    loads = np.zeros((*item.q.shape, modes.shape[1] + 1))
+    loads[frame.nodes, :, :-1] = modes.reshape(len(frame.nodes), 3, -1)
+    loads[..., -1] = -(frame.simulator.weight + item.virtual_force)
+    return np.moveaxis(frame.simulator.solve_tangent(item.q[None], loads[None])[0], -1, 0)
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """The sum of squared differences near some variables x (n), in units of the variance of a difference.
+
+    Attributes:
+        variance: [m^2], larger where the differences of successive frames are alike.
+        gradient: half of it without the priors, (n).
+        normal: half the Gauss-Newton matrix with the priors, (n, n).
+    """
+
+    variance: float
+    gradient: Array
+    normal: Array
+
+    @classmethod
+    def of(cls, residual: Tensor, jacobian: Tensor) -> "_Linearised":
+        """From weighted differences (T, .., 2) [m], zero where not seen, and their derivatives (T, .., 2, n)."""
+        r, count = residual.numpy(), jacobian.shape[-1]
+        both = (r[1:] != 0.0) & (r[:-1] != 0.0)
+        square, product = float((r[:-1] ** 2 * both).sum()), float((r[1:] * r[:-1]).sum())
+        likeness = float(np.clip(product / square, 0.0, MAX_LIKENESS)) if square > 0.0 else 0.0
+        freedom = max(int(np.count_nonzero(r)) - count, 1)
+        variance = float((r**2).sum()) / freedom * (1.0 + likeness) / (1.0 - likeness)
+        slopes = jacobian.numpy().reshape(-1, count)
+        return cls(variance, slopes.T @ r.ravel() / variance, slopes.T @ slopes / variance + np.eye(count))

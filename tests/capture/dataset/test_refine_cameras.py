@@ -1,0 +1,143 @@
+"""Cameras that were touched after their calibration, and clocks that are late, are found from the recordings."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from filmed_markers import side_camera
+from scipy.interpolate import CubicSpline
+
+from rafl.calibration.rig import Rig, rig_text
+from rafl.capture.dataset.build import build_dataset
+from rafl.capture.dataset.camera_summary import camera_rows, camera_warnings
+from rafl.capture.dataset.settings import CaptureSettings
+from rafl.capture.dataset.table import RecordingRow
+from rafl.capture.registration.camera_change import CameraChange
+from rafl.capture.rendering.motion import tip_load_release
+from rafl.capture.specimen.specimen import Specimen
+from rafl.common.errors import InputError
+from rafl.data.dataset import Dataset
+from rafl.data.dataset_file import read_dataset, write_dataset
+from rafl.tracking.linking.layout import MarkerLayout
+from rafl.tracking.reconstruction.gap_filling import MEASURED, MISSING
+from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+
+FRAMES, STILL, SIGMA_PX, STEP = 30, 6, 0.02, 0.01
+LATE = 0.3  # of the right camera's clock [frames]
+TURN = np.radians(0.2) * np.array([0.6, 0.8, 0.0])  # of the right camera [rad]
+CALIBRATED = {"left": side_camera(-0.7), "right": side_camera(0.7)}
+ROW = RecordingRow(recording="swing", load_g=60, split="train")
+
+
+@pytest.fixture(scope="module")
+def front(small_specimen: Specimen) -> Specimen:
+    """The specimen with the markers of one side only."""
+    kept = small_specimen.layout.positions[:, 1] == 0.0
+    names = tuple(name for name, own in zip(small_specimen.layout.names, kept, strict=True) if own)
+    layout = MarkerLayout(names, small_specimen.layout.positions[kept], 0.0)
+    return replace(small_specimen, layout=layout)
+
+
+@pytest.fixture(scope="module")
+def motion(front: Specimen) -> np.ndarray:
+    """Node positions [m], (T, N, 3), of a specimen softer than assumed, after some frames at rest."""
+    softer = replace(front.material, youngs_modulus=0.4 * front.material.youngs_modulus)
+    swing = tip_load_release(front, softer, 0.03, FRAMES, 1.0 / STEP).q
+    return np.concatenate([np.repeat(swing[:1], STILL, axis=0), swing])
+
+
+def write_swing(folder: Path, specimen: Specimen, motion: np.ndarray, late: float) -> None:
+    """Tracks with the calibrated cameras of what cameras saw of which the right one was turned, and is late."""
+    markers, random = specimen.markers(1e-6), np.random.default_rng(0)
+    path = CubicSpline(np.arange(len(motion) - STILL), motion[STILL:])
+    change = CameraChange(np.concatenate([TURN, np.zeros(4)]), markers.rest.mean(axis=0))
+    true = {"left": CALIBRATED["left"], "right": change.moved(CALIBRATED["right"])}
+    pixels = {}
+    for name, camera in true.items():
+        time = np.arange(len(motion)) - STILL - (late if name == "right" else 0.0)
+        exact = markers.positions(torch.from_numpy(path(np.maximum(time, 0.0)))).numpy()
+        pixel = camera.project(exact) + random.normal(0.0, SIGMA_PX, (*exact.shape[:2], 2))
+        pixels[name] = CameraPixels(pixel, np.full_like(pixel, SIGMA_PX))
+    rig = Rig(dict(CALIBRATED))
+    position, sigma, residual = triangulate(rig, pixels)
+    write_tracks(
+        folder / "swing.h5",
+        Tracks(
+            names=markers.names,
+            time=STEP * np.arange(len(motion)),
+            position=position,
+            sigma=sigma,
+            state=np.where(np.isfinite(position[..., 0]), MEASURED, MISSING).astype(np.uint8),
+            pixel={name: item.pixel for name, item in pixels.items()},
+            residual=residual,
+            pixel_sigma={name: item.sigma for name, item in pixels.items()},
+            damaged={name: np.zeros(len(motion), bool) for name in pixels},
+            frame={name: np.arange(len(motion)) for name in pixels},
+            images={name: {} for name in pixels},
+            fps=1.0 / STEP,
+            calibration=rig_text(rig),
+            sources={},
+            settings="",
+        ),
+    )
+
+
+def built(folder: Path, specimen: Specimen, refine: bool, row: RecordingRow = ROW) -> Dataset:
+    settings = CaptureSettings(start=STILL, initial="rest", refine_cameras=refine)
+    return build_dataset(specimen, folder, [row], settings, "", lambda: None)
+
+
+@pytest.fixture(scope="module")
+def datasets(tmp_path_factory: pytest.TempPathFactory, front: Specimen, motion: np.ndarray) -> tuple[Dataset, Dataset]:
+    """The dataset with the cameras as calibrated, and as found."""
+    folder = tmp_path_factory.mktemp("tracks")
+    write_swing(folder, front, motion, LATE)
+    return built(folder, front, False), built(folder, front, True)
+
+
+def test_turn_and_clock_are_found(datasets: tuple[Dataset, Dataset]) -> None:
+    attributes = datasets[1].trajectories["swing"].attributes
+    left, right = (np.asarray(attributes[f"camera_change_{name}"]) for name in ("left", "right"))
+    assert np.abs(right[:3] - TURN).max() < np.radians(0.02)
+    assert np.abs(left[:3]).max() < np.radians(0.02)
+    assert abs(right[6] - LATE * STEP) < 0.005 * STEP
+    for found, turn in ((left, np.zeros(3)), (right, TURN)):
+        assert (np.abs(found[:3] - turn) < 4.0 * found[7:10]).all()
+
+
+def test_first_frame_is_nearer_to_the_truth(datasets: tuple[Dataset, Dataset], motion: np.ndarray) -> None:
+    before, after = (np.sqrt(((item.trajectories["swing"].q - motion[STILL]) ** 2).sum(-1).mean()) for item in datasets)
+    assert after < 2e-5
+    assert 5.0 * after < before
+
+
+def test_views_and_positions_are_those_of_the_found_cameras(
+    datasets: tuple[Dataset, Dataset], front: Specimen, motion: np.ndarray
+) -> None:
+    item = datasets[1].trajectories["swing"]
+    assert item.views["right"].lag == pytest.approx(-LATE * STEP, abs=1e-4)
+    assert item.views["left"].lag == pytest.approx(0.0, abs=1e-6)
+    exact = front.markers(1e-6).positions(torch.from_numpy(motion[STILL:])).numpy()
+    error = item.markers - exact
+    assert np.nanstd(error[1:-1], axis=0).max() < 2e-5
+
+
+def test_changes_are_reported_and_kept(datasets: tuple[Dataset, Dataset], tmp_path: Path) -> None:
+    write_dataset(tmp_path / "beam.h5", datasets[1])
+    rows = {row.camera: row for row in camera_rows(read_dataset(tmp_path / "beam.h5"))}
+    assert rows["right"].touched
+    assert not rows["left"].touched
+    assert rows["right"].clock.startswith("+0.29")
+    (line,) = camera_warnings(datasets[1])
+    assert line.startswith("camera right: ")
+    assert "calibrate again" in line
+    assert camera_rows(datasets[0]) == []
+
+
+def test_recordings_that_cannot_show_it_are_refused(tmp_path: Path, front: Specimen, motion: np.ndarray) -> None:
+    write_swing(tmp_path, front, motion, 0.0)
+    with pytest.raises(InputError, match="--refine-cameras: expected a training recording"):
+        built(tmp_path, front, True, ROW.model_copy(update={"split": "test"}))
