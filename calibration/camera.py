@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[Any]
 
+# Differences of [mx, my, skew] [px/mm], the rotation vector [rad], the offset [px], and k1, k2; far above rounding.
+PARAMETER_STEPS = (*(1e-4,) * 3, *(1e-6,) * 3, *(1e-3,) * 2, *(1e-6,) * 2)
 COMPLEX_STEP = 1e-20  # [m]; its square vanishes beside 1 in the computer
 
 
@@ -128,6 +130,13 @@ class Camera:
         """
         return np.zeros((*points.shape[:-1], 2))
 
+    def calibration_sigma(self, points: Array) -> float:
+        """Root mean square standard deviation of a coordinate of the pixels of points (..., 3) [m] [px].
+
+        It follows from the covariance; NaN for a camera without one.
+        """
+        return float("nan")
+
     def distort(self, undistorted: Array) -> Array:
         """Distorted pixels (..., 2) of undistorted pixels (..., 2)."""
         raise NotImplementedError
@@ -210,6 +219,32 @@ class OrthographicCamera(Camera):
         size = np.copysign(np.hypot(depth, depth_sigma), depth)
         result: Array = (centre - self.project_undistorted(points)) * (size / self.perspective.distance)[..., None]
         return result
+
+    def calibration_sigma(self, points: Array) -> float:
+        """See `Camera`. The derivatives are by differences: the projection is nearly linear in the parameters."""
+        if self.covariance is None:
+            return super().calibration_sigma(points)
+        base, slopes = self.project(points), []
+        for parameter, step in enumerate(PARAMETER_STEPS):
+            slopes.append((self._with_parameter(parameter, step).project(points) - base) / step)
+        by_parameter = np.stack(slopes, axis=-1)
+        variance = np.einsum("...k,kl,...l->...", by_parameter, np.asarray(self.covariance), by_parameter)
+        return float(np.sqrt(variance.mean()))
+
+    def _with_parameter(self, parameter: int, step: float) -> "OrthographicCamera":
+        """The camera with one of the parameters of the covariance increased."""
+        scale = 1e-3 * np.array([*self.scale, self.skew])  # [px/mm]
+        values = np.concatenate([scale, self.rotation_vector, self.offset, self.distortion])
+        values[parameter] += step
+        scale = 1e3 * values[:3]
+        return replace(
+            self,
+            scale=(float(scale[0]), float(scale[1])),
+            skew=float(scale[2]),
+            rotation_vector=tuple(values[3:6].tolist()),
+            offset=tuple(values[6:8].tolist()),
+            distortion=tuple(values[8:].tolist()),
+        )
 
     def distort(self, undistorted: Array) -> Array:
         """See `Camera`."""

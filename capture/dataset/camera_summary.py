@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.calibration.camera import Camera
-from rafl.calibration.uncertainty import calibration_sigma
 from rafl.capture.dataset.registered import Registered
 from rafl.capture.registration.camera_change import CLOCK, CameraChange
 from rafl.data.dataset import Dataset
@@ -52,7 +51,7 @@ def change_attributes(changes: dict[str, CameraChange], item: Registered, rest: 
             continue
         camera, calibrated = item.views[name].camera, item.recording.views[name].camera
         moved, sigma = _pixel_change(change, camera, rest)
-        own = calibration_sigma(calibrated, (rest - pose.translation) @ pose.rotation)
+        own = calibrated.calibration_sigma((rest - pose.translation) @ pose.rotation)
         sigmas = np.sqrt(np.diag(change.covariance))
         result[PREFIX + name] = np.concatenate([change.value, sigmas, [moved, sigma, own]])
     return result

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from rafl.calibration.camera import OrthographicCamera, PinholeCamera
-from rafl.calibration.uncertainty import calibration_sigma
 
 CAMERA = OrthographicCamera(
     image_size=(1280, 720),
@@ -37,12 +36,12 @@ def test_sigma_is_the_spread_of_the_pixels(random: np.random.Generator) -> None:
             ).project(points)
         )
     spread = float(np.sqrt(np.var(drawn, axis=0).mean()))
-    assert calibration_sigma(camera, points) == pytest.approx(spread, rel=0.05)
+    assert camera.calibration_sigma(points) == pytest.approx(spread, rel=0.05)
 
 
 def test_camera_without_covariance_has_no_sigma() -> None:
     pinhole = PinholeCamera(
         image_size=(640, 480), rotation_vector=(0, 0, 0), focal=(900, 900), centre=(320, 240), translation=(0, 0, 1)
     )
-    assert np.isnan(calibration_sigma(CAMERA, np.zeros((2, 3))))
-    assert np.isnan(calibration_sigma(pinhole, np.zeros((2, 3))))
+    assert np.isnan(CAMERA.calibration_sigma(np.zeros((2, 3))))
+    assert np.isnan(pinhole.calibration_sigma(np.zeros((2, 3))))
