@@ -17,7 +17,6 @@ from rafl.capture.dataset.registered import Registered, find_dataset_places
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
-from rafl.capture.registration.camera_change import CameraChange
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.initial import InitialState, fit_first_frame, fit_velocity
 from rafl.capture.registration.motion_start import MotionStart
@@ -40,9 +39,9 @@ Array = NDArray[Any]
 
 VELOCITY_WINDOW_FRAMES = 5  # the polynomial through all of them gives the velocity in the first frame
 SAME_PLACE = 1e-9  # [m]
-# First frames follow the cameras not quite linearly. They are fitted again until the cameras change by less than a
-# share of their standard deviations.
-MAX_REFINEMENTS, SETTLED = 4, 0.3
+# First frames follow the cameras not quite linearly. They are fitted again until the cameras change by less than
+# some of their standard deviations.
+MAX_REFINEMENTS, SETTLED = 3, 1.0
 
 
 def build_dataset(
@@ -94,17 +93,16 @@ def build_dataset(
         registration = register(recording, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
         registered.append(Registered.of(specimen, recording, row, registration, settings))
     dataset, changed = _with_recordings(empty, specimen, registered, known, settings, tick)
-    changes: dict[str, CameraChange] = {}
+    found = None
     for _ in range(MAX_REFINEMENTS if settings.refine_cameras else 0):
-        found = refine_cameras(dataset, specimen, registered, changes, settings.forces == "surface")
-        changes = found.changes
-        changed = [item.with_changes(changes) for item in registered]
+        found = refine_cameras(dataset, specimen, registered, found, settings.forces == "surface")
+        changed = [item.with_changes(found.changes) for item in registered]
         dataset, changed = _with_recordings(empty, specimen, changed, known, settings, lambda: None)
         if found.moved < SETTLED:
             break
     trajectories = {
         item.row.recording: _with_attributes(
-            dataset.trajectories[item.row.recording], change_attributes(changes, item, dataset.markers.rest)
+            dataset.trajectories[item.row.recording], change_attributes(found, item, dataset.markers.rest)
         )
         for item in registered
     }

@@ -7,8 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.calibration.camera import Camera
+from rafl.capture.dataset.refine_cameras import Refinement
 from rafl.capture.dataset.registered import Registered
 from rafl.capture.registration.camera_change import CLOCK, CameraChange
+from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 
 Array = NDArray[Any]
@@ -24,7 +26,8 @@ class CameraRow:
     Attributes:
         camera: its name.
         turn, shift, clock: with their standard deviations, in degrees, mm and frames.
-        pixels: root mean square change of the markers' pixels at rest, and the calibration's own uncertainty of them.
+        pixels: root mean square change of the markers' pixels at rest, the calibration's own uncertainty of them, and
+            what the model leaves unexplained.
         touched: whether the change is more than the calibration's uncertainty.
     """
 
@@ -36,25 +39,39 @@ class CameraRow:
     touched: bool
 
 
-def change_attributes(changes: dict[str, CameraChange], item: Registered, rest: Array) -> dict[str, Array]:
+def change_attributes(found: Refinement | None, item: Registered, rest: Array) -> dict[str, Array]:
     """Attributes of a recording that hold the changes of its cameras; see `datasets/README.md`.
 
     Args:
-        changes: by camera.
+        found: changes of the cameras; None if they were not searched.
         item: the recording, with its cameras as calibrated.
         rest: places of the markers at rest [m], (M, 3).
+
+    Raises:
+        InputError: a camera's change is smaller than what the model leaves unexplained.
     """
-    pose = item.registration.pose
-    result = {}
-    for name, change in changes.items():
-        if name not in item.views:
-            continue
+    pose, result = item.registration.pose, dict[str, Array]()
+    if found is None:
+        return result
+    for name in set(found.changes) & set(item.views):
+        change = found.changes[name]
         camera, calibrated = item.views[name].camera, item.recording.views[name].camera
         moved, sigma = _pixel_change(change, camera, rest)
         own = calibrated.calibration_sigma((rest - pose.translation) @ pose.rotation)
+        if _touched(moved, sigma, own) and moved < found.unexplained[name]:
+            raise InputError(
+                f"--refine-cameras: camera {name} would have its pixels moved by {moved:.2g} px, but the simulated "
+                f"motion is {found.unexplained[name]:.2g} px from the recorded one in any case: errors of the model "
+                "cannot be told from a turned camera; leave the option out, or check the specimen file"
+            )
         sigmas = np.sqrt(np.diag(change.covariance))
-        result[PREFIX + name] = np.concatenate([change.value, sigmas, [moved, sigma, own]])
+        result[PREFIX + name] = np.concatenate([change.value, sigmas, [moved, sigma, own, found.unexplained[name]]])
     return result
+
+
+def _touched(moved: float, sigma: float, calibration: float) -> bool:
+    """Whether a change of the pixels is more than its uncertainty and that of the calibration (NaN if not known)."""
+    return bool(moved > MAX_SIGMAS * np.hypot(sigma, np.nan_to_num(calibration)))
 
 
 def _pixel_change(change: CameraChange, camera: Camera, points: Array) -> tuple[float, float]:
@@ -72,7 +89,8 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
         found |= {key.removeprefix(PREFIX): value for key, value in item.attributes.items() if key.startswith(PREFIX)}
     rows = []
     for name, numbers in found.items():
-        value, sigma, (moved, moved_sigma, own) = np.split(np.asarray(numbers, dtype=float), [CLOCK + 1, 2 * CLOCK + 2])
+        value, sigma, pixels = np.split(np.asarray(numbers, dtype=float), [CLOCK + 1, 2 * CLOCK + 2])
+        moved, moved_sigma, own, unexplained = pixels
         frames = 1.0 / dataset.simulator.time_step
         known = "" if np.isnan(own) else f" (calibration +- {own:.2g})"
         rows.append(
@@ -81,8 +99,8 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
                 _pairs(np.degrees(value[:3]), np.degrees(sigma[:3])),
                 _pairs(1e3 * value[3:CLOCK], 1e3 * sigma[3:CLOCK]),
                 _pairs(frames * value[CLOCK:], frames * sigma[CLOCK:]),
-                f"{moved:.3g} +- {moved_sigma:.2g}{known}",
-                bool(moved > MAX_SIGMAS * np.hypot(moved_sigma, np.nan_to_num(own))),
+                f"{moved:.3g} +- {moved_sigma:.2g}{known}, {unexplained:.2g} unexplained",
+                _touched(moved, moved_sigma, own),
             )
         )
     return rows

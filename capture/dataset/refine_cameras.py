@@ -20,7 +20,7 @@ from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError, SimulationError
 from rafl.data.dataset import Dataset, Trajectory
 from rafl.data.objective import CameraTerm, Recordings
-from rafl.data.views import at_lags, project, project_slope
+from rafl.data.views import at_lags, project_slope
 from rafl.fitting.gauss_newton import bounded_step
 from rafl.fitting.quantities import METHOD_QUANTITIES, MODULUS, material_values
 from rafl.simulation.rollout import rollout
@@ -34,10 +34,10 @@ CLOCK_SIGMA, RELEASE_SIGMA = 0.5, 0.3  # [frames]
 REFERENCE_SIGMA = 1e-6  # of the first camera's clock, which the others' are told against [frames]
 LEAST_PLACE_SIGMA = 1e-7  # of a place that is exactly known [m]
 QUANTITIES = METHOD_QUANTITIES["sysid-loss"]
-RECORDINGS = 3  # from the largest to the least motion; more hardly tell more
+RECORDINGS = 2  # of the largest and the least motion; more hardly tell more
 FRAME_SHARES = 0.4, 1.0  # a search over many oscillations starts near its end
-ITERATIONS, HALVINGS = 8, 5
-SETTLED = 0.05  # a step of fewer standard deviations ends the search
+LINEARISATIONS, STEPS, HALVINGS = 4, 4, 5
+SETTLED = 0.1  # a step of fewer standard deviations ends the search
 MATERIAL_STEP = 1e-4  # of a variable, for differences
 FIRST_FRAME_STEP = 1e-6  # root mean square motion of the nodes, for differences [m]
 TIME_STEP = 1e-2  # [frames]
@@ -52,17 +52,21 @@ class Refinement:
     Attributes:
         changes: by camera.
         moved: largest change of this search over its standard deviation.
+        material: variables of the material that were found with them.
+        unexplained: root mean square difference of a coordinate of the pixels that remains, by camera [px].
     """
 
     changes: dict[str, CameraChange]
     moved: float
+    material: Array
+    unexplained: dict[str, float]
 
 
 def refine_cameras(
     dataset: Dataset,
     specimen: Specimen,
     registered: list[Registered],
-    before: dict[str, CameraChange],
+    before: Refinement | None,
     whole_surface: bool,
 ) -> Refinement:
     """Find the cameras' changes from the training recordings that start at rest.
@@ -77,13 +81,19 @@ def refine_cameras(
         dataset: built with the cameras as changed before.
         specimen: its description.
         registered: recordings of the dataset, with their cameras as calibrated.
-        before: changes so far, by camera; empty at first.
+        before: changes so far; None at first.
         whole_surface: whether virtual forces act on the whole surface.
 
     Raises:
-        InputError: no training recording in a known frame has pixels and starts at rest.
+        InputError: no training recording in a known frame has pixels and starts at rest, or the elements lock.
         SimulationError: a simulation failed.
     """
+    if specimen.material.integration != "enhanced":
+        raise InputError(
+            "--refine-cameras: expected elements that follow a bent body, found integration: "
+            f"{specimen.material.integration}, whose errors would be taken for turned cameras; use preset: physical in "
+            "the specimen file, or leave the option out"
+        )
     usable = [item for item in registered if item.row.split == "train" and item.views and not item.start.moving]
     usable = [item for item in usable if not item.registration.pose_from_model]
     if not usable:
@@ -96,7 +106,7 @@ def refine_cameras(
     chosen = [usable[k] for k in np.argsort(motion)[ranks]]
     search = _Search(dataset, specimen, chosen, before, whole_surface)
     x = search.begin
-    for share in FRAME_SHARES:
+    for share in FRAME_SHARES if before is None else FRAME_SHARES[-1:]:
         x, covariance = search.minimise(x, share)
     return search.refinement(x, covariance)
 
@@ -113,7 +123,7 @@ class _Search:
         dataset: Dataset,
         specimen: Specimen,
         chosen: list[Registered],
-        before: dict[str, CameraChange],
+        before: Refinement | None,
         whole_surface: bool,
     ) -> None:
         self.dataset, markers = dataset, dataset.markers
@@ -151,9 +161,11 @@ class _Search:
                 np.repeat(places, 3),
             ]
         )
-        self.built = {name: before[name].value if name in before else np.zeros(7) for name in self.cameras}
+        changes = {} if before is None else before.changes
+        self.built = {name: changes[name].value if name in changes else np.zeros(7) for name in self.cameras}
         start, mean = np.zeros((2, ends[-1]))
-        start[self.material] = mean[self.material] = self._assumed(chosen)
+        mean[self.material] = self._assumed(chosen)
+        start[self.material] = mean[self.material] if before is None else before.material
         for name, own in zip(self.cameras, self.poses, strict=True):
             start[own] = self.built[name]
         mean[self.places] = 0.0 if markers.moved is None else -markers.moved.ravel()
@@ -173,21 +185,37 @@ class _Search:
         return np.array([np.clip(q.variable(v), *q.bounds) for q, v in zip(QUANTITIES, values, strict=True)])
 
     def minimise(self, x: Array, share: float) -> tuple[Array, Array]:
-        """Variables that minimise the objective over a share of the frames, from x (n), and their covariance (n, n)."""
+        """Variables that minimise the objective over a share of the frames, from x (n), and their covariance (n, n).
+
+        The derivatives are kept for several steps: they change slowly, and cost many simulations.
+        """
         recordings = self.recordings.first_frames(max(round(share * len(self.recordings.markers)), 2))
-        for _ in range(ITERATIONS):
-            found = self._linearised(recordings, x)
-            step = bounded_step(found.normal, found.gradient + x - self.mean, self.low - x, self.high - x)
-            covariance = np.linalg.inv(found.normal)
-            if np.abs(step / np.sqrt(np.diag(covariance))).max() < SETTLED:
-                break
-            least = self._objective(recordings, x, found.variance)
-            for _ in range(HALVINGS):
-                if self._objective(recordings, x + step, found.variance) < least:
+        for _ in range(LINEARISATIONS):
+            begin, (found, jacobian) = x, self._linearised(recordings, x)
+            for _ in range(STEPS):
+                variance = found.variance(len(x))
+                normal = jacobian.T @ jacobian / variance + np.eye(len(x))
+                gradient = jacobian.T @ found.weighted.ravel() / variance + x - self.mean
+                step = bounded_step(normal, gradient, self.low - x, self.high - x)
+                covariance = np.linalg.inv(normal)
+                if self._settled(step, covariance):
                     break
-                step *= 0.5
-            x = x + step
+                least = found.objective / variance + float(((x - self.mean) ** 2).sum())
+                for _ in range(HALVINGS):
+                    trial = self._differences(recordings, x + step)
+                    own = trial.objective / variance + float(((x + step - self.mean) ** 2).sum())
+                    if own < least:
+                        break
+                    step *= 0.5
+                else:
+                    break
+                x, found = x + step, trial
+            if self._settled(x - begin, covariance):
+                break
         return x, covariance
+
+    def _settled(self, step: Array, covariance: Array) -> bool:
+        return bool(np.abs(step / np.sqrt(np.diag(covariance))).max() < SETTLED)
 
     def refinement(self, x: Array, covariance: Array) -> Refinement:
         """The changes of the cameras at variables x."""
@@ -197,7 +225,12 @@ class _Search:
             sigma = scale[:, None] * covariance[own, own] * scale
             changes[name] = CameraChange(x[own] * scale, self.centre, sigma)
             moved = max(moved, float((np.abs(x[own] * scale - self.built[name]) / np.sqrt(np.diag(sigma))).max()))
-        return Refinement(changes, moved)
+        markers, q = self._simulated(self.recordings, x[None])
+        placed, unexplained = self._placed(markers[:, 0], self._place_gain(q), x), {}
+        for name, term in zip(self.cameras, self._terms(self.recordings, x), strict=True):
+            gaps = term.gap(placed)[term.seen > 0]
+            unexplained[name] = float(gaps.square().mean().sqrt())
+        return Refinement(changes, moved, (x * self.scale)[self.material], unexplained)
 
     def _simulated(self, recordings: Recordings, sets: Array) -> tuple[Tensor, Tensor]:
         """Markers (T, S, R, M, 3) [m] of sets of variables (S, n) at their places as built, and node positions."""
@@ -239,21 +272,27 @@ class _Search:
         moved = torch.from_numpy((x * self.scale)[self.places].reshape(-1, 3, 1))
         return markers + (gain @ moved)[..., 0]
 
-    def _objective(self, recordings: Recordings, x: Array, variance: float) -> float:
-        """Squared differences under Huber's loss over their variance, and squared deviations from the priors."""
+    def _differences(self, recordings: Recordings, x: Array) -> "_Differences":
+        """Simulated minus measured pixels at x; infinite if a simulation fails."""
         try:
             markers, q = self._simulated(recordings, x[None])
         except SimulationError:
-            return np.inf
+            return _Differences(np.inf, np.zeros((len(recordings.markers), 1)))
         placed = self._placed(markers[:, 0], self._place_gain(q), x)
-        total, limit = 0.0, recordings.limit[None, :, None]
-        for term in self._terms(recordings, x):
-            square = (term.root @ term.gap(placed)[..., None])[..., 0].square().sum(-1)
-            total += float(torch.where(square > limit, 2.0 * (limit * square).sqrt() - limit, square).sum())
-        return total / variance + float(((x - self.mean) ** 2).sum())
+        return self._compared(recordings, self._terms(recordings, x), placed)
 
-    def _linearised(self, recordings: Recordings, x: Array) -> "_Linearised":
-        """Whitened differences of the pixels and their derivatives at x."""
+    def _compared(self, recordings: Recordings, terms: list[CameraTerm], placed: Tensor) -> "_Differences":
+        """Differences of the pixels of markers (T, R, M, 3) [m]."""
+        limit, objective, weighted = recordings.limit[None, :, None], 0.0, []
+        for term in terms:
+            gap = (term.root @ term.gap(placed)[..., None])[..., 0]
+            square = gap.square().sum(-1)
+            objective += float(torch.where(square > limit, 2.0 * (limit * square).sqrt() - limit, square).sum())
+            weighted.append(gap * _huber_root(square, limit)[..., None])
+        return _Differences(objective, torch.cat(weighted, dim=2).numpy())
+
+    def _linearised(self, recordings: Recordings, x: Array) -> tuple["_Differences", Array]:
+        """Differences of the pixels at x, and their derivatives (K, n)."""
         material, first = len(QUANTITIES), self.start.shape[1]
         columns = np.stack([np.arange(own.start, own.stop) for own in self.first_frames])  # (R, D)
         sets = np.tile(x, (1 + material + first, 1))
@@ -263,18 +302,14 @@ class _Search:
         simulated, q = self._simulated(recordings, sets)
         steps = torch.from_numpy(np.concatenate([np.full(material, MATERIAL_STEP), self.first_steps]))
         change = (simulated[:, 1:] - simulated[:, :1]) / steps[:, None, None, None]
-        gain = self._place_gain(q)
-        placed = self._placed(simulated[:, 0], gain, x)
-        residuals, jacobians = [], []
-        terms = zip(self._terms(recordings, x), self._changes(x), self.poses, strict=True)
-        for term, camera_change, own_pose in terms:
+        gain, limit, jacobians = self._place_gain(q), recordings.limit[None, :, None], []
+        placed, terms = self._placed(simulated[:, 0], gain, x), self._terms(recordings, x)
+        for term, camera_change, own_pose in zip(terms, self._changes(x), self.poses, strict=True):
             points = at_lags(placed, term.lag)
-            residual = (term.root @ (project(points, term.cameras) - term.pixel)[..., None])[..., 0]
-            size = residual.norm(dim=-1, keepdim=True).clamp_min(1e-300)
-            weight = (recordings.limit.sqrt()[None, :, None, None] / size).clamp_max(1.0).sqrt()
-            root = weight[..., None] * term.root
+            square = (term.root @ term.gap(placed)[..., None])[..., 0].square().sum(-1)
+            root = _huber_root(square, limit)[..., None, None] * term.root
             slope = root @ project_slope(points, term.cameras)  # (T, R, M, 2, 3)
-            jacobian = torch.zeros((*residual.shape, len(x)), dtype=torch.float64)
+            jacobian = torch.zeros((*slope.shape[:-1], len(x)), dtype=torch.float64)
             for k in range(material + first):
                 by_start = (slope @ at_lags(change[:, k], term.lag)[..., None])[..., 0]
                 if k < material:
@@ -291,12 +326,39 @@ class _Search:
             for r in range(len(recordings.names)):
                 jacobian[:, r, :, :, self.releases.start + r] = by_time[:, r]
             by_place = slope @ gain
-            for m in range(residual.shape[2]):
+            for m in range(slope.shape[2]):
                 place = self.places.start + 3 * m
                 jacobian[:, :, m, :, place : place + 3] = by_place[:, :, m]
-            residuals.append(weight * residual)
             jacobians.append(jacobian * torch.from_numpy(self.scale))
-        return _Linearised.of(torch.cat(residuals, dim=2), torch.cat(jacobians, dim=2))
+        derivatives = torch.cat(jacobians, dim=2).numpy().reshape(-1, len(x))
+        return self._compared(recordings, terms, placed), derivatives
+
+
+def _huber_root(square: Tensor, limit: Tensor) -> Tensor:
+    """Square roots of the weights of differences by Huber's loss, (T, R, M)."""
+    return (limit / square.clamp_min(1e-300)).clamp_max(1.0).sqrt().sqrt()
+
+
+@dataclass(frozen=True)
+class _Differences:
+    """Differences of the pixels at some variables.
+
+    Attributes:
+        objective: sum of Huber's loss [m^2].
+        weighted: by the roots of its weights [m], (T, ..), zero where not seen.
+    """
+
+    objective: float
+    weighted: Array
+
+    def variance(self, variables: int) -> float:
+        """Variance of a difference [m^2]; larger where those of successive frames are alike."""
+        r = self.weighted
+        both = (r[1:] != 0.0) & (r[:-1] != 0.0)
+        square, product = float((r[:-1] ** 2 * both).sum()), float((r[1:] * r[:-1]).sum())
+        likeness = float(np.clip(product / square, 0.0, MAX_LIKENESS)) if square > 0.0 else 0.0
+        freedom = max(int(np.count_nonzero(r)) - variables, 1)
+        return float((r**2).sum()) / freedom * (1.0 + likeness) / (1.0 - likeness)
 
 
 def _at_rest(term: CameraTerm, name: str, chosen: list[Registered]) -> CameraTerm:
@@ -321,30 +383,3 @@ def _start_directions(frame: FirstFrame, item: Trajectory) -> Array:
     loads[frame.nodes, :, :-1] = modes.reshape(len(frame.nodes), 3, -1)
     loads[..., -1] = -(frame.simulator.weight + item.virtual_force)
     return np.moveaxis(frame.simulator.solve_tangent(item.q[None], loads[None])[0], -1, 0)
-
-
-@dataclass(frozen=True)
-class _Linearised:
-    """The sum of squared differences near some variables x (n), in units of the variance of a difference.
-
-    Attributes:
-        variance: [m^2], larger where the differences of successive frames are alike.
-        gradient: half of it without the priors, (n).
-        normal: half the Gauss-Newton matrix with the priors, (n, n).
-    """
-
-    variance: float
-    gradient: Array
-    normal: Array
-
-    @classmethod
-    def of(cls, residual: Tensor, jacobian: Tensor) -> "_Linearised":
-        """From weighted differences (T, .., 2) [m], zero where not seen, and their derivatives (T, .., 2, n)."""
-        r, count = residual.numpy(), jacobian.shape[-1]
-        both = (r[1:] != 0.0) & (r[:-1] != 0.0)
-        square, product = float((r[:-1] ** 2 * both).sum()), float((r[1:] * r[:-1]).sum())
-        likeness = float(np.clip(product / square, 0.0, MAX_LIKENESS)) if square > 0.0 else 0.0
-        freedom = max(int(np.count_nonzero(r)) - count, 1)
-        variance = float((r**2).sum()) / freedom * (1.0 + likeness) / (1.0 - likeness)
-        slopes = jacobian.numpy().reshape(-1, count)
-        return cls(variance, slopes.T @ r.ravel() / variance, slopes.T @ slopes / variance + np.eye(count))
