@@ -268,9 +268,12 @@ class _EvenGrid:
 
     def resample(self, view: View) -> View:
         """A view of the recorded frames in the rows of the even times."""
+        recorded = np.searchsorted(self.slot, np.arange(len(self.time)), side="right") - 1  # or the last one before
         return View(
             view.camera,
             self.fill(view.pixel, np.nan),
             self.fill(view.covariance, np.nan),
             self.fill(view.lag, 0.0),
+            None if view.rotation is None else view.rotation[recorded],
+            None if view.translation is None else view.translation[recorded],
         )

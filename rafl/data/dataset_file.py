@@ -37,11 +37,11 @@ from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-FORMAT = "rafl-dataset/2"  # 2: with views
+FORMAT = "rafl-dataset/3"  # 2: with views; 3: also of a moving clamp
 UNITS = "SI: m, s, kg, N, Pa; specimen frame: origin at a corner of the clamped face, x to the tip, z up"
 SPECIMEN_GROUPS = ("mesh", "material", "markers")  # groups that all recordings share
 HASH_ATTRIBUTE = "sha256"
-CALIBRATION = "calibration"  # of a recording's views: the cameras as in calib.yaml, in the specimen frame
+CALIBRATION = "calibration"  # of a recording's views: the cameras as in calib.yaml, in the frame of `View`
 LABEL, ADVICE = "a dataset written by rafl-capture", "build it again"  # in messages about unreadable files
 # Unit and frame of every array, by its name. The hashes cover these texts: changing one breaks updates of older files.
 UNITS_AND_FRAMES = {
@@ -66,6 +66,8 @@ UNITS_AND_FRAMES = {
     "pixel": ("px", "image; (0, 0) is the centre of its first pixel"),
     "covariance": ("px2", "image"),
     "lag": ("s", "from the row's time on"),
+    "rotation": ("1", "calibration to specimen, when the camera measured"),
+    "translation": ("m", "specimen"),
 }
 
 
@@ -151,7 +153,7 @@ def _write(file: h5py.File, dataset: Dataset, recipe: str) -> None:
         for key in INITIAL_ARRAYS:
             _write_array(file, f"trajectories/{name}/initial/{key}", getattr(item, key))
         for camera, view in item.views.items():
-            for key in VIEW_ARRAYS:
+            for key in (key for key in VIEW_ARRAYS if getattr(view, key) is not None):
                 _write_array(file, f"trajectories/{name}/views/{camera}/{key}", getattr(view, key))
         if item.views:
             rig = Rig({camera: view.camera for camera, view in item.views.items()})

@@ -15,7 +15,7 @@ from torch import Tensor
 from rafl.calibration.camera import Camera
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset, Trajectory
-from rafl.data.views import MIN_ANGLE, View, at_lags, project, project_slope
+from rafl.data.views import MIN_ANGLE, View, at_lags, leave_moving_frame, project, project_slope
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.rollout import ResidualForce, rollout
 from rafl.simulation.simulator import Simulator
@@ -35,12 +35,14 @@ class CameraTerm:
     """What one camera measured of B recordings, padded to the longest.
 
     Attributes:
-        cameras: in the specimen frame of each recording, (B).
+        cameras: of each recording, (B), as in `View`.
         pixel: (T, B, M, 2) [px], zero where not seen.
         root: inverse square root of the pixels' covariances times the dataset's reference sigma [m/px], (T, B, M, 2,
             2), zero where not seen. It turns a difference of pixels into a distance in the body.
         lag: of the measurements [time steps], (T, B).
         scale: of the image at the markers [px/m], (T, B, M); 1 where not seen.
+        rotation, translation: of the specimen frame, as in `View`, (T, B, 3, 3) and [m], (T, B, 3); those of the
+            identity where it is at rest.
     """
 
     cameras: list[Camera]
@@ -48,6 +50,8 @@ class CameraTerm:
     root: Tensor
     lag: Tensor
     scale: Tensor
+    rotation: Tensor
+    translation: Tensor
 
     @property
     def seen(self) -> Tensor:
@@ -56,13 +60,20 @@ class CameraTerm:
 
     def index(self, frames: slice, recordings: list[int] | slice, markers: NDArray[np.int64] | slice) -> "CameraTerm":
         """The measurements of some frames, recordings and markers."""
+        by_frame = {key: getattr(self, key)[frames][:, recordings] for key in ("lag", "rotation", "translation")}
         chosen = {key: getattr(self, key)[frames][:, recordings][:, :, markers] for key in ("pixel", "root", "scale")}
         cameras = self.cameras[recordings] if isinstance(recordings, slice) else [self.cameras[b] for b in recordings]
-        return CameraTerm(cameras, lag=self.lag[frames][:, recordings], **chosen)
+        return CameraTerm(cameras, **by_frame, **chosen)
 
     def gap(self, markers: Tensor) -> Tensor:
         """Simulated minus measured pixels, (T, B, M, 2), of simulated markers (T, B, M, 3) [m]."""
-        return project(at_lags(markers, self.lag), self.cameras) - self.pixel
+        measured = at_lags(markers, self.lag)
+        return project(leave_moving_frame(measured, self.rotation, self.translation), self.cameras) - self.pixel
+
+    def slope(self, markers: Tensor) -> Tensor:
+        """Derivatives of the pixels by the markers when the camera measured [px/m], (T, B, M, 2, 3)."""
+        at_rest = leave_moving_frame(markers, self.rotation, self.translation)
+        return project_slope(at_rest, self.cameras) @ self.rotation.mT[:, :, None]
 
 
 @dataclass(frozen=True)
@@ -216,9 +227,8 @@ class Recordings:
             return [slope * self.weight.sqrt()[:, None]]
         result = []
         for term in self.terms.values():
-            lagging = at_lags(simulated, term.lag)
             own = torch.stack([at_lags(slope[:, k], term.lag) for k in range(slope.shape[1])], dim=1)
-            change = project_slope(lagging, term.cameras)[:, None] @ own[..., None]
+            change = term.slope(at_lags(simulated, term.lag))[:, None] @ own[..., None]
             result.append((term.root[:, None] @ change)[..., 0])
         return result
 
@@ -227,9 +237,10 @@ class Recordings:
         if not self.in_image:
             return self.valid[frame][..., None, None] * torch.eye(3, dtype=torch.float64)
         information = torch.zeros((*self.valid[frame].shape, 3, 3), dtype=torch.float64)
-        for term in self.terms.values():
-            slope = project_slope(self.markers[frame][None], term.cameras)[0] / term.scale[frame][..., None, None]
-            information += (term.seen * self.valid)[frame][..., None, None] * (slope.mT @ slope)
+        one = slice(frame, frame + 1)
+        for term in (term.index(one, slice(None), slice(None)) for term in self.terms.values()):
+            slope = (term.slope(self.markers[one]) / term.scale[..., None, None])[0]
+            information += (term.seen[0] * self.valid[frame])[..., None, None] * (slope.mT @ slope)
         values, vectors = torch.linalg.eigh(information)
         known = (values > MIN_ANGLE**2 * values[..., 1:2]) & (values[..., 1:2] > 0.0)
         projection: Tensor = vectors @ (known[..., None] * vectors.mT)
@@ -244,7 +255,7 @@ def _median_sigma(dataset: Dataset) -> float:
 
 def _scale(view: View, markers: NDArray[np.float64]) -> NDArray[np.float64]:
     """Scale of the image at markers (T, M, 3) [px/m], (T, M)."""
-    slope = view.camera.jacobian(markers)
+    slope = view.jacobian(markers)
     scale: NDArray[np.float64] = np.linalg.det(slope @ slope.swapaxes(-1, -2)) ** 0.25
     return scale
 
@@ -277,7 +288,8 @@ def _camera_terms(dataset: Dataset, items: list[Trajectory], frames: int, refere
     for name in dict.fromkeys(name for item in items for name in item.views):
         pixel, root = np.zeros((frames, len(items), count, 2)), np.zeros((frames, len(items), count, 2, 2))
         lag, scale = np.zeros((frames, len(items))), np.ones((frames, len(items), count))
-        cameras = []
+        rotation = np.broadcast_to(np.eye(3), (frames, len(items), 3, 3)).copy()
+        translation, cameras = np.zeros((frames, len(items), 3)), []
         for b, item in enumerate(items):
             view = item.views.get(name)
             cameras.append(next(iter(item.views.values())).camera if view is None else view.camera)
@@ -293,7 +305,10 @@ def _camera_terms(dataset: Dataset, items: list[Trajectory], frames: int, refere
             pixel[:length, b] = np.where(seen[..., None], view.pixel, 0.0)
             lag[:length, b] = view.lag / dataset.simulator.time_step
             scale[:length, b] = own
-        result[name] = CameraTerm(cameras, *(torch.from_numpy(array) for array in (pixel, root, lag, scale)))
+            if view.rotation is not None:
+                rotation[:length, b], translation[:length, b] = view.rotation, view.translation
+        arrays = pixel, root, lag, scale, rotation, translation
+        result[name] = CameraTerm(cameras, *(torch.from_numpy(array) for array in arrays))
     return result
 
 
