@@ -18,7 +18,7 @@ from rafl.common.errors import InputError
 from rafl.common.hdf5_files import read_hdf5, write_hdf5
 from rafl.common.names import require_names
 from rafl.common.version import VERSION
-from rafl.common.yaml_files import check_format
+from rafl.common.yaml_files import check_format, describe_validation
 from rafl.data.dataset import (
     INITIAL_ARRAYS,
     MARKER_ARRAYS,
@@ -302,23 +302,31 @@ class _RecordingAttributes(pydantic.BaseModel):
 
 def _read_trajectory(group: h5py.Group, lengths: dict[str, int], label: str) -> Trajectory:
     attributes = _attributes(group)
-    _RecordingAttributes.model_validate(attributes)
+    try:
+        _RecordingAttributes.model_validate(attributes)
+    except pydantic.ValidationError as error:
+        raise ValueError(f"{label[:-1]}, {describe_validation(error)}") from None
     return Trajectory(
         **read_arrays(group, RECORDING_ARRAYS, lengths, label),
         **read_arrays(group["initial"], INITIAL_ARRAYS, lengths, f"{label}initial/"),
         split=attributes.pop("split"),
         attributes=attributes,
-        views=_read_views(group["views"], lengths, f"{label}views/") if "views" in group else {},
+        views=_read_views(group["views"], lengths, f"{label}views") if "views" in group else {},
     )
 
 
 def _read_views(group: h5py.Group, lengths: dict[str, int], label: str) -> dict[str, View]:
     """The views of a recording, by camera."""
-    rig = parse_calibration(str(group.attrs[CALIBRATION]), Path(group.file.filename))
+    if not isinstance(group, h5py.Group) or CALIBRATION not in group.attrs:
+        raise ValueError(f"{label}: expected a group with the attribute {CALIBRATION}, found none")
+    try:
+        rig = parse_calibration(str(group.attrs[CALIBRATION]), Path(group.file.filename))
+    except InputError as error:
+        raise InputError(f"{label}, {CALIBRATION}: {error}") from None
     if set(rig.cameras) != set(group):
-        raise ValueError(f"{label}: expected the cameras {', '.join(rig.cameras)}, found {', '.join(group)}")
+        raise ValueError(f"{label}: expected the cameras {', '.join(rig.cameras)}, found {', '.join(group) or 'none'}")
     return {
-        name: View(camera, **read_arrays(group[name], VIEW_ARRAYS, lengths, f"{label}{name}/"))
+        name: View(camera, **read_arrays(group[name], VIEW_ARRAYS, lengths, f"{label}/{name}/"))
         for name, camera in rig.cameras.items()
     }
 

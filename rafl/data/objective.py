@@ -124,9 +124,9 @@ class Recordings:
             valid[: len(item.time), b] = item.valid
             own = (median / np.maximum(item.sigma, MIN_RELATIVE_SIGMA * median)) ** 2 if by_sigma else 1.0
             weight[: len(item.time), b] = item.valid[..., None] * own
-        with_views = all(item.views for item in items)
-        if objective == "image" and not with_views:
-            lacking = next(name for name, item in zip(names, items, strict=True) if not item.views)
+        with_pixels = all(item.has_pixels for item in items)
+        if objective == "image" and not with_pixels:
+            lacking = next(name for name, item in zip(names, items, strict=True) if not item.has_pixels)
             raise InputError(
                 f"{dataset.name}, recording {lacking}: expected the pixels that its cameras measured, found positions "
                 "only; build the dataset again from tracks, or compare positions with --objective 3d"
@@ -134,7 +134,7 @@ class Recordings:
         stacked = [torch.from_numpy(array) for array in (markers, valid, weight)]
         infinite = torch.full((len(names),), torch.inf, dtype=torch.float64)
         found = cls(dataset, names, stacked[0], stacked[1], stacked[2], {}, infinite)
-        if not with_views:
+        if not with_pixels:
             return found
         reference = _reference_sigma(dataset)
         least = torch.tensor((MIN_HUBER_SIGMAS * reference) ** 2, dtype=torch.float64)
@@ -253,13 +253,6 @@ def _median_sigma(dataset: Dataset) -> float:
     return float(np.median(sigma[np.isfinite(sigma)]))
 
 
-def _scale(view: View, markers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scale of the image at markers (T, M, 3) [px/m], (T, M)."""
-    slope = view.jacobian(markers)
-    scale: NDArray[np.float64] = np.linalg.det(slope @ slope.swapaxes(-1, -2)) ** 0.25
-    return scale
-
-
 def _image_sigma(view: View) -> NDArray[np.float64]:
     """Standard deviation of a pixel, the geometric mean of both directions [px], (T, M); NaN where not seen."""
     with np.errstate(invalid="ignore"):
@@ -270,7 +263,7 @@ def _image_sigma(view: View) -> NDArray[np.float64]:
 def _reference_sigma(dataset: Dataset) -> float:
     """Median over a dataset of the pixels' sigmas, as distances in the body [m]."""
     sigmas = [
-        (_image_sigma(view) / _scale(view, _known(item)))[view.seen]
+        (_image_sigma(view) / view.scale(_known(item)))[view.seen]
         for item in dataset.trajectories.values()
         for view in item.views.values()
     ]
@@ -296,7 +289,7 @@ def _camera_terms(dataset: Dataset, items: list[Trajectory], frames: int, refere
             if view is None:
                 continue
             length, seen = len(item.time), view.seen
-            own = _scale(view, _known(item))
+            own = view.scale(_known(item))
             least = (MIN_RELATIVE_SIGMA * reference * own) ** 2
             values, vectors = np.linalg.eigh(np.where(seen[..., None, None], view.covariance, np.eye(2)))
             inverse = reference / np.sqrt(np.maximum(values, least[..., None]))

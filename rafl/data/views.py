@@ -16,14 +16,19 @@ Array = NDArray[Any]
 
 # Cameras whose lines of sight differ by less than this [rad] do not show a marker's position along them.
 MIN_ANGLE = 0.1
+MAX_PIXEL = 1e6  # no image is larger [px]
 VIEW_ARRAYS = {
-    "pixel": ArrayFormat(("T", "M", 2), finite=False),
+    "pixel": ArrayFormat(("T", "M", 2), finite=False, low=-MAX_PIXEL, high=MAX_PIXEL),
     "covariance": ArrayFormat(("T", "M", 2, 2), finite=False),
     "lag": ArrayFormat(("T",)),
     "rotation": ArrayFormat(("T", 3, 3), optional=True),
     "translation": ArrayFormat(("T", 3), optional=True),
 }
 MAX_ROTATION_ERROR = 1e-6  # of the elements of R^T R - 1
+# What measurements of a camera can be; others are damage.
+MIN_SIGMA, MAX_SIGMA = 1e-6, 1e6  # of a pixel [px]
+MIN_SCALE, MAX_SCALE = 1.0, 1e9  # of an image at a marker [px/m]
+MAX_GAP = 0.25  # between a pixel and the projection of the marker's position, as a share of the image's diagonal
 
 
 @dataclass(frozen=True)
@@ -91,20 +96,57 @@ class View:
         pixel = self.pixel + (camera.project(near) - self.project(near))
         return replace(self, camera=camera, pixel=pixel, rotation=None, translation=None)
 
-    def check(self, label: str) -> None:
-        """Raise ValueError unless every pixel that was seen has a covariance, and rotations turn only."""
+    def scale(self, points: Array) -> Array:
+        """Scale of the image at points (T, M, 3) [px/m], the geometric mean of both directions, (T, M)."""
+        slope = self.jacobian(points)
+        scale: Array = np.linalg.det(slope @ slope.swapaxes(-1, -2)) ** 0.25
+        return scale
+
+    def check(self, label: str, positions: Array) -> None:
+        """Check that the values are such as a camera measures.
+
+        Args:
+            label: begins the messages.
+            positions: of the markers [m], (T, M, 3), NaN where not known.
+
+        Raises:
+            ValueError: a pixel has no covariance, a rotation does not only turn, or the camera shows the markers
+                elsewhere.
+        """
+        if not (np.isfinite(self.pixel) == self.seen[..., None]).all() or np.isinf(self.pixel).any():
+            raise ValueError(f"{label}/pixel: expected two finite numbers, or two NaN where a marker is not seen")
         own = self.covariance[self.seen]
         symmetric = np.isfinite(own).all() and np.allclose(own, own.swapaxes(1, 2), rtol=1e-6)
-        if not symmetric or (len(own) and np.linalg.eigvalsh(own).min() <= 0.0):
-            raise ValueError(f"{label}/covariance: expected a positive definite matrix for every pixel")
-        if not np.isfinite(self.pixel[self.seen]).all():
-            raise ValueError(f"{label}/pixel: expected two finite numbers where a marker is seen")
+        variances = np.linalg.eigvalsh(own) if symmetric else np.zeros(1)
+        if not ((variances >= MIN_SIGMA**2) & (variances <= MAX_SIGMA**2)).all():
+            raise ValueError(
+                f"{label}/covariance: expected a positive definite matrix for every pixel, with standard deviations "
+                f"from {MIN_SIGMA:g} to {MAX_SIGMA:g} px"
+            )
         if (self.rotation is None) != (self.translation is None):
             raise ValueError(f"{label}: expected both rotation and translation of a moving frame, found one of them")
         if self.rotation is not None:
             error = np.abs(self.rotation.swapaxes(1, 2) @ self.rotation - np.eye(3)).max(initial=0.0)
             if error > MAX_ROTATION_ERROR or (np.linalg.det(self.rotation) < 0.0).any():
                 raise ValueError(f"{label}/rotation: expected rotation matrices")
+        self._check_camera(label, positions)
+
+    def _check_camera(self, label: str, positions: Array) -> None:
+        """Raise ValueError unless the camera shows the positions of seen markers near their pixels."""
+        compared = self.seen & np.isfinite(positions).all(axis=2)
+        with np.errstate(all="ignore"):
+            gap = np.linalg.norm(self.project(positions) - self.pixel, axis=2)[compared]
+            scale = self.scale(positions)[compared]
+        largest = MAX_GAP * float(np.linalg.norm(self.camera.image_size))
+        if not (gap <= largest).all():
+            raise ValueError(
+                f"{label}: expected pixels within {largest:.0f} px of where the calibrated camera shows the markers, "
+                f"found some {gap.max():.3g} px off"
+            )
+        if not ((scale >= MIN_SCALE) & (scale <= MAX_SCALE)).all():
+            raise ValueError(
+                f"{label}: expected a camera that shows the markers with {MIN_SCALE:g} to {MAX_SCALE:g} px/m"
+            )
 
 
 def leave_moving_frame(points: Any, rotation: Any, translation: Any) -> Any:

@@ -292,7 +292,7 @@ def test_attributes_that_are_no_such_numbers_are_refused(
     read_dataset(path)
     with h5py.File(path, "r+") as file:
         file["trajectories/a"].attrs[key] = value
-    with pytest.raises(InputError, match=f"which cannot be read: {key}: "):
+    with pytest.raises(InputError, match=f"which cannot be read: trajectories/a, {key}: "):
         read_dataset(path)
 
 
