@@ -13,7 +13,7 @@ from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.naming import read_marker_names as read_marker_names
 from rafl.capture.dataset.settings import CaptureSettings as CaptureSettings
 from rafl.capture.dataset.sources import read_recording
-from rafl.capture.dataset.summary import print_contents, recordings_table, warnings
+from rafl.capture.dataset.summary import missing_pixels, print_contents, recordings_table, warnings
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
 from rafl.capture.description.describe import MEASURED_SIGMA, describe
 from rafl.capture.description.specimen_files import (
@@ -245,7 +245,8 @@ def capture(
     with written_files({report: dataset_page(described, dataset)}):
         (update_dataset if update else write_dataset)(path, dataset)
     Console(width=130).print(recordings_table(dataset))
-    for line in warnings(dataset):
+    whole = read_dataset(path) if update else dataset
+    for line in dict.fromkeys([*warnings(dataset), *missing_pixels(whole)]):
         typer.echo(f"warning: {line}", err=True)
     typer.echo(f"wrote {path} and {report}")
     typer.echo(f"next: rafl-fit {path}")

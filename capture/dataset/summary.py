@@ -79,7 +79,18 @@ def warnings(dataset: Dataset) -> list[str]:
                 f"{start - not_free} to {start - 1} (a hand, a slack string, or a load that touches again); it starts "
                 f"after them"
             )
-    return lines + contradictions(dataset)
+    return [*lines, *missing_pixels(dataset), *contradictions(dataset)]
+
+
+def missing_pixels(dataset: Dataset) -> list[str]:
+    """A message on recordings of which only positions are known, if others have pixels."""
+    without = [name for name, item in dataset.trajectories.items() if not item.has_pixels]
+    if not without or len(without) == len(dataset.trajectories):
+        return []
+    return [
+        f"recordings {', '.join(without)}: no pixels, which the others have; where they are compared together, all are "
+        "by their 3-D positions; build them again from tracks"
+    ]
 
 
 def _frame_through_model(recordings: list[dict[str, Any]]) -> str:

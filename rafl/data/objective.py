@@ -192,6 +192,14 @@ class Recordings:
         return torch.stack([term.seen for term in self.terms.values()]).amax(0)
 
     @property
+    def located(self) -> Tensor:
+        """1 where the position of a marker was measured, if there are pixels by several cameras, else 0, (T, B, M)."""
+        if not self.terms:
+            return self.valid
+        several = torch.stack([term.seen for term in self.terms.values()]).sum(0) > 1
+        return self.valid * several
+
+    @property
     def observed_coordinates(self) -> float:
         """Number of coordinates after the first frame that the loss compares."""
         if self.in_image:
@@ -376,7 +384,7 @@ def marker_distances(recordings: Recordings, simulated: Tensor) -> Tensor:
         in_image = torch.zeros_like(distance)
         for term in recordings.terms.values():
             in_image += term.seen * torch.linalg.norm(term.gap(simulated), dim=-1) / term.scale
-        distance = torch.where((count > 1) & (recordings.valid > 0), distance, in_image / count.clamp_min(1.0))
+        distance = torch.where(recordings.located > 0, distance, in_image / count.clamp_min(1.0))
     return torch.where(recordings.observed > 0, distance, torch.nan)
 
 
