@@ -2,7 +2,9 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 import torch
@@ -14,13 +16,17 @@ from rafl.calibration.rig import Rig, rig_text
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.registered import average_views
 from rafl.capture.dataset.settings import CaptureSettings
+from rafl.capture.dataset.summary import missing_pixels
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.rigid import RigidTransform
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.capture.specimen.specimen import Specimen
+from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
-from rafl.data.dataset_file import read_dataset, write_dataset
+from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
 from rafl.data.objective import Recordings, recording_losses
+from rafl.evaluation.metrics import compare
+from rafl.fitting.fit import fit
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
@@ -217,3 +223,31 @@ def test_the_mean_of_frames_at_rest_allows_for_a_clamp_that_shakes(
     np.testing.assert_allclose(target[known], exact[0, known], atol=2e-5)
     assert np.isnan(target[3]).all()
     assert (sigma[known] < 1e-5).all()
+
+
+def test_a_file_of_the_first_format_takes_recordings_with_pixels(
+    front: Specimen, motion: np.ndarray, tmp_path: Path
+) -> None:
+    """Its own have none. It is read, told of, evaluated and fitted by positions; pixels alone cannot be compared."""
+    write_swing(tmp_path, front, motion, 0.0)
+    path, new = tmp_path / "data.h5", build(front, tmp_path)
+    assert missing_pixels(new) == []
+    item = new.trajectories["swing"]
+    write_dataset(path, replace(new, trajectories={"old": replace(item, views={})}))
+    with h5py.File(path, "r+") as file:
+        file.attrs["format"] = "rafl-dataset/1"
+    assert missing_pixels(read_dataset(path)) == []
+    update_dataset(path, new)
+    assert damaged_parts(path) == []
+    whole = read_dataset(path)
+    assert {name: list(own.views) for name, own in whole.trajectories.items()} == {"old": [], "swing": ["left"]}
+    (line,) = missing_pixels(whole)
+    assert line.startswith("recordings old: no pixels, which the others have")
+    assert [each.recording for each in compare(whole, {})] == ["old", "swing"]
+    options: dict[str, Any] = {"method": "sysid-e", "epochs": 1, "frames": 3}
+    with pytest.raises(InputError, match="small, recording old: expected the pixels that its cameras measured"):
+        fit(path, tmp_path / "image", objective="image", **options)
+    assert not (tmp_path / "image").exists()
+    told: list[str] = []
+    assert fit(path, tmp_path / "any", notify=told.append, **options).material is not None
+    assert "some recordings have no pixels" in told[0]
