@@ -177,6 +177,7 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
             "forces": settings.forces,
             "fit_residual_mm": 1e3 * initial.residual,
             "fit_markers_mm": 1e3 * np.linalg.norm(residual, axis=1),
+            "fit_sigma_mm": 1e3 * (np.full(len(frame.target), np.nan) if start.moving else initial.marker_sigma),
             "source": recording.source,
             "corrections": recording.corrections,
             "unfit_corrections": recording.unfit_corrections,

@@ -21,8 +21,8 @@ TOLD_APART = 0.1  # standard deviation of log E up to which a frame is told apar
 
 
 def recordings_table(dataset: Dataset) -> Table:
-    """Table with one row per recording: split, load, first frame, and residuals of registration and first frame."""
-    fits = ("registration [mm]", "first frame fit [mm]")
+    """Table with one row per recording: split, load, first frame, residuals of registration and first frame, sigma."""
+    fits = ("registration [mm]", "first frame fit [mm]", "sigma [mm]")
     table = create_table("recording", "split", "load [g]", "frames", "valid", "first frame", *fits)
     for name, item in dataset.trajectories.items():
         values = item.attributes
@@ -40,8 +40,16 @@ def recordings_table(dataset: Dataset) -> Table:
             first_frame,
             _number(values.get("registration_residual_mm"), ".3f"),
             _number(values.get("fit_residual_mm"), ".3f"),
+            _number(largest_sigma(values), ".2g"),
         )
     return table
+
+
+def largest_sigma(attributes: dict[str, Any]) -> float:
+    """Largest standard deviation of a marker in the fitted first frame [mm]; NaN if none is known."""
+    sigma = np.asarray(attributes.get("fit_sigma_mm", np.nan), dtype=float)
+    known = sigma[np.isfinite(sigma)]
+    return float(known.max()) if known.size else np.nan
 
 
 def _number(value: object, format_spec: str) -> str:

@@ -37,15 +37,6 @@ SETTINGS = CaptureSettings(start=0, initial="rest")
 
 
 @pytest.fixture(scope="module")
-def front(small_specimen: Specimen) -> Specimen:
-    """The specimen with the markers of one side only."""
-    kept = small_specimen.layout.positions[:, 1] == 0.0
-    names = tuple(name for name, own in zip(small_specimen.layout.names, kept, strict=True) if own)
-    layout = MarkerLayout(names, small_specimen.layout.positions[kept], 0.0)
-    return replace(small_specimen, layout=layout)
-
-
-@pytest.fixture(scope="module")
 def motion(front: Specimen) -> np.ndarray:
     """Node positions [m], (T, N, 3), of a specimen softer than assumed."""
     softer = replace(front.material, youngs_modulus=0.8 * front.material.youngs_modulus)
@@ -121,6 +112,10 @@ def test_first_frame_does_not_depend_on_the_assumed_depth(front: Specimen, motio
     assert np.abs(found[0].markers - found[1].markers).max() == pytest.approx(0.002)
     distance = np.sqrt(((found[0].q - motion[0]) ** 2).sum(-1).mean())
     assert distance < 4e-4  # out of the image plane nothing but the shape tells the position
+    sigma = np.asarray(found[0].attributes["fit_sigma_mm"])
+    assert sigma.shape == (len(front.layout.names),)
+    assert 0.05 < sigma.max() < 0.5
+    assert 1e3 * distance < 3.0 * sigma.max()
 
 
 def test_pixels_are_kept_with_their_camera_and_markers(front: Specimen, motion: np.ndarray, tmp_path: Path) -> None:
