@@ -17,7 +17,7 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}
 <style>
  body{font:16px/1.5 system-ui,sans-serif;max-width:66rem;margin:2rem auto;padding:0 1rem;color:#222}
  table{border-collapse:collapse;margin:1rem 0;display:block;overflow-x:auto}
- th,td{padding:.25rem .6rem;text-align:right;border-bottom:1px solid #ddd}
+ th,td{padding:.25rem .4rem;text-align:right;border-bottom:1px solid #ddd}
  td:first-child,th:first-child{text-align:left}
  img{max-width:100%} .note{color:#666} .worse{color:#c0392b}
 </style>
