@@ -13,7 +13,13 @@ from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.naming import read_marker_names as read_marker_names
 from rafl.capture.dataset.settings import CaptureSettings as CaptureSettings
 from rafl.capture.dataset.sources import read_recording
-from rafl.capture.dataset.summary import cameras_table, print_contents, recordings_table, warnings
+from rafl.capture.dataset.summary import (
+    cameras_table,
+    missing_pixels,
+    print_contents,
+    recordings_table,
+    warnings,
+)
 from rafl.capture.dataset.table import RecordingRow, read_recording_rows
 from rafl.capture.description.describe import MEASURED_SIGMA, describe
 from rafl.capture.description.specimen_files import (
@@ -248,7 +254,8 @@ def capture(
     console.print(recordings_table(dataset))
     if cameras := cameras_table(dataset):
         console.print(cameras)
-    for line in warnings(dataset):
+    whole = read_dataset(path) if update else dataset
+    for line in dict.fromkeys([*warnings(dataset), *missing_pixels(whole)]):
         typer.echo(f"warning: {line}", err=True)
     typer.echo(f"wrote {path} and {report}")
     typer.echo(f"next: rafl-fit {path}")

@@ -5,7 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from rafl.capture.dataset.camera_summary import camera_rows
-from rafl.capture.dataset.summary import warnings
+from rafl.capture.dataset.summary import largest_sigma, warnings
 from rafl.capture.specimen.specimen import Specimen
 from rafl.data.dataset import Dataset
 from rafl.data.markers import Markers
@@ -18,7 +18,7 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}
 <style>
  body{font:16px/1.5 system-ui,sans-serif;max-width:66rem;margin:2rem auto;padding:0 1rem;color:#222}
  table{border-collapse:collapse;margin:1rem 0;display:block;overflow-x:auto}
- th,td{padding:.25rem .6rem;text-align:right;border-bottom:1px solid #ddd}
+ th,td{padding:.25rem .4rem;text-align:right;border-bottom:1px solid #ddd}
  td:first-child,th:first-child{text-align:left}
  img{max-width:100%} .note{color:#666} .worse{color:#c0392b}
 </style>
@@ -29,10 +29,12 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}
 <img alt="mesh with markers" src="data:image/png;base64,{{ mesh_image }}">
 <h2>Recordings</h2>
 <p class="note">Registration: largest distance of a marker from its layout position after the transform to the specimen
-frame. First frame fit: root mean square distance between the markers of the fitted mesh and the recorded ones.</p>
+frame. First frame fit: root mean square distance between the markers of the fitted mesh and the recorded ones. Sigma:
+largest standard deviation of a marker of the fitted mesh in any direction; across the line of sight of one camera it is
+small, along it only the specimen's shape tells the position.</p>
 <table><tr><th>recording</th><th>split</th><th>load [g]</th><th>frames</th><th>valid</th><th>first frame</th>
 <th>found from</th><th>state</th><th>frames averaged</th><th>registered by</th><th>registration [mm]</th>
-<th>first frame fit [mm]</th></tr>
+<th>first frame fit [mm]</th><th>sigma [mm]</th></tr>
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 {% if cameras %}<h2>Cameras</h2>
 <p class="note">How each camera was found to have moved since its calibration, and how late its clock is: turned about
@@ -121,6 +123,7 @@ def _row(name: str, dataset: Dataset) -> list[object]:
         values["registration"],
         _measured(float(str(values["registration_residual_mm"])), ".3f"),
         f"{values['fit_residual_mm']:.3f}",
+        _measured(largest_sigma(values), ".2g"),
     ]
 
 

@@ -207,6 +207,7 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
             "forces": settings.forces,
             "fit_residual_mm": 1e3 * initial.residual,
             "fit_markers_mm": 1e3 * np.linalg.norm(residual, axis=1),
+            "fit_sigma_mm": 1e3 * (np.full(len(frame.target), np.nan) if start.moving else initial.marker_sigma),
             "source": recording.source,
             "corrections": recording.corrections,
             "unfit_corrections": recording.unfit_corrections,
@@ -302,9 +303,12 @@ class _EvenGrid:
 
     def resample(self, view: View) -> View:
         """A view of the recorded frames in the rows of the even times."""
+        recorded = np.searchsorted(self.slot, np.arange(len(self.time)), side="right") - 1  # or the last one before
         return View(
             view.camera,
             self.fill(view.pixel, np.nan),
             self.fill(view.covariance, np.nan),
             self.fill(view.lag, 0.0),
+            None if view.rotation is None else view.rotation[recorded],
+            None if view.translation is None else view.translation[recorded],
         )

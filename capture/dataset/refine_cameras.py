@@ -20,7 +20,7 @@ from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError, SimulationError
 from rafl.data.dataset import Dataset, Trajectory
 from rafl.data.objective import CameraTerm, Recordings
-from rafl.data.views import at_lags, project_slope
+from rafl.data.views import at_lags
 from rafl.fitting.gauss_newton import bounded_step
 from rafl.fitting.quantities import METHOD_QUANTITIES, MODULUS, material_values
 from rafl.simulation.rollout import rollout
@@ -85,7 +85,8 @@ def refine_cameras(
         whole_surface: whether virtual forces act on the whole surface.
 
     Raises:
-        InputError: no training recording in a known frame has pixels and starts at rest, or the elements lock.
+        InputError: no training recording in a known frame has pixels and starts at rest, the elements lock, or the
+            clamp moves.
         SimulationError: a simulation failed.
     """
     if specimen.material.integration != "enhanced":
@@ -94,6 +95,8 @@ def refine_cameras(
             f"{specimen.material.integration}, whose errors would be taken for turned cameras; use preset: physical in "
             "the specimen file, or leave the option out"
         )
+    if any(view.rotation is not None for item in registered for view in item.views.values()):
+        raise InputError("--refine-cameras: expected a clamp at rest, found one that moves; leave the option out")
     usable = [item for item in registered if item.row.split == "train" and item.views and not item.start.moving]
     usable = [item for item in usable if not item.registration.pose_from_model]
     if not usable:
@@ -308,7 +311,7 @@ class _Search:
             points = at_lags(placed, term.lag)
             square = (term.root @ term.gap(placed)[..., None])[..., 0].square().sum(-1)
             root = _huber_root(square, limit)[..., None, None] * term.root
-            slope = root @ project_slope(points, term.cameras)  # (T, R, M, 2, 3)
+            slope = root @ term.slope(points)  # (T, R, M, 2, 3)
             jacobian = torch.zeros((*slope.shape[:-1], len(x)), dtype=torch.float64)
             for k in range(material + first):
                 by_start = (slope @ at_lags(change[:, k], term.lag)[..., None])[..., 0]

@@ -31,7 +31,7 @@ class Registered:
     Attributes:
         recording, row, registration: of which it is made.
         position, sigma: of the specimen's markers [m], (T, M, 3).
-        views: what each camera measured of them, by its name; empty if not known, or if the clamp moves.
+        views: what each camera measured of them, by its name; empty if not known.
         start: where the motion starts, and in which state.
         last: last frame that is used.
     """
@@ -118,11 +118,13 @@ class Registered:
 
 
 def _in_frame(views: dict[str, View], pose: RigidTransform) -> dict[str, View]:
-    """The views with their cameras in the specimen frame; none if the pose differs between frames."""
+    """The views in the specimen frame, to which a pose leads from the cameras' frame, one or one for every frame."""
     if pose is IDENTITY:
         return views
     if pose.rotation.ndim > 2:
-        return {}
+        return {
+            name: replace(view, rotation=pose.rotation, translation=pose.translation) for name, view in views.items()
+        }
     return {
         name: replace(view, camera=view.camera.in_frame(pose.rotation, pose.translation))
         for name, view in views.items()
@@ -141,7 +143,7 @@ def average_views(views: dict[str, View], near: Array) -> tuple[Array, Array, Ar
         `rafl.data.views.seen_axes`. In directions that were not measured a position stays near the given one.
     """
     means = {}
-    for name, view in views.items():
+    for name, view in ((name, view.without_motion(near)) for name, view in views.items()):
         known = np.isfinite(near[:, :1])
         pixel, sigma = average_frames(view.pixel, np.sqrt(np.diagonal(view.covariance, axis1=-2, axis2=-1)))
         seen = known & np.isfinite(sigma)
@@ -155,8 +157,8 @@ def average_views(views: dict[str, View], near: Array) -> tuple[Array, Array, Ar
     step = np.zeros_like(target)
     for view in means.values():
         seen = view.seen[0]
-        slope = view.camera.jacobian(near[seen])
-        gap = view.pixel[0, seen] - view.camera.project(near[seen])
+        slope = view.jacobian(near[seen])[0]
+        gap = view.pixel[0, seen] - view.project(near[seen])[0]
         step[seen] += (slope.swapaxes(1, 2) @ np.linalg.solve(view.covariance[0, seen], gap[..., None]))[..., 0]
     along = np.where(np.isfinite(sigma), sigma, 0.0) ** 2 * (axes @ step[..., None])[..., 0]
     return target + (axes.swapaxes(1, 2) @ along[..., None])[..., 0], axes, sigma

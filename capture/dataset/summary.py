@@ -22,8 +22,8 @@ TOLD_APART = 0.1  # standard deviation of log E up to which a frame is told apar
 
 
 def recordings_table(dataset: Dataset) -> Table:
-    """Table with one row per recording: split, load, first frame, and residuals of registration and first frame."""
-    fits = ("registration [mm]", "first frame fit [mm]")
+    """Table with one row per recording: split, load, first frame, residuals of registration and first frame, sigma."""
+    fits = ("registration [mm]", "first frame fit [mm]", "sigma [mm]")
     table = create_table("recording", "split", "load [g]", "frames", "valid", "first frame", *fits)
     for name, item in dataset.trajectories.items():
         values = item.attributes
@@ -41,6 +41,7 @@ def recordings_table(dataset: Dataset) -> Table:
             first_frame,
             _number(values.get("registration_residual_mm"), ".3f"),
             _number(values.get("fit_residual_mm"), ".3f"),
+            _number(largest_sigma(values), ".2g"),
         )
     return table
 
@@ -52,6 +53,13 @@ def cameras_table(dataset: Dataset) -> Table | None:
     for row in rows:
         table.add_row(row.camera, row.turn, row.shift, row.clock, row.pixels)
     return table if rows else None
+
+
+def largest_sigma(attributes: dict[str, Any]) -> float:
+    """Largest standard deviation of a marker in the fitted first frame [mm]; NaN if none is known."""
+    sigma = np.asarray(attributes.get("fit_sigma_mm", np.nan), dtype=float)
+    known = sigma[np.isfinite(sigma)]
+    return float(known.max()) if known.size else np.nan
 
 
 def _number(value: object, format_spec: str) -> str:
@@ -89,7 +97,18 @@ def warnings(dataset: Dataset) -> list[str]:
                 f"{start - not_free} to {start - 1} (a hand, a slack string, or a load that touches again); it starts "
                 f"after them"
             )
-    return lines + camera_warnings(dataset) + contradictions(dataset)
+    return [*lines, *missing_pixels(dataset), *camera_warnings(dataset), *contradictions(dataset)]
+
+
+def missing_pixels(dataset: Dataset) -> list[str]:
+    """A message on recordings of which only positions are known, if others have pixels."""
+    without = [name for name, item in dataset.trajectories.items() if not item.has_pixels]
+    if not without or len(without) == len(dataset.trajectories):
+        return []
+    return [
+        f"recordings {', '.join(without)}: no pixels, which the others have; where they are compared together, all are "
+        "by their 3-D positions; build them again from tracks"
+    ]
 
 
 def _frame_through_model(recordings: list[dict[str, Any]]) -> str:

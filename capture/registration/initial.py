@@ -35,12 +35,15 @@ class InitialState:
         force: virtual nodal forces, without gravity [N], (N, 3).
         residual: root mean square marker distance over the observed axes [m].
         pose: from the frame of the target to the specimen frame; the identity if it was not fitted.
+        marker_sigma: largest standard deviation of each marker's position in any direction [m], (M); NaN where the
+            marker was not measured, and in fits without Young's modulus.
     """
 
     q: Array
     force: Array
     residual: float
     pose: RigidTransform
+    marker_sigma: Array
 
 
 def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> InitialState:
@@ -62,6 +65,7 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
         SimulationError: an equilibrium could not be found.
     """
     with_pose, zero = pose is not None, np.zeros_like(frame.simulator.mesh.vertices)
+    marker_sigma = np.full(len(frame.target), np.nan)
     if frame.whole_surface:
         search = _LevenbergMarquardt(frame, with_pose, SURFACE_FORCE_SIGMA, 0.0)
         best = search.minimise(zero, pose or IDENTITY, None)
@@ -74,17 +78,20 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
         sigma = frame.sigma[frame.measured][frame.observed_axes]
         model_sigma = np.sqrt(max(_rms(frame, first.residual) ** 2 - float((sigma**2).mean()), 0.0))
 
-        def refine(local_sigma: float, start: _Estimate) -> _Estimate:
+        def refine(local_sigma: float, start: _Estimate) -> tuple[_LevenbergMarquardt, _Estimate]:
             search = _LevenbergMarquardt(frame, with_pose, local_sigma, model_sigma, with_modulus)
-            return search.minimise(start.force, start.pose, start.q, start.log_modulus)
+            return search, search.minimise(start.force, start.pose, start.q, start.log_modulus)
 
-        best = refine(little, first)
-        trial = refine(more, best)
-        best = trial if _rms(frame, trial.residual) < 0.5 * _rms(frame, best.residual) else best
+        search, best = refine(little, first)
+        other, trial = refine(more, best)
+        if _rms(frame, trial.residual) < 0.5 * _rms(frame, best.residual):
+            search, best = other, trial
+        if with_modulus:
+            marker_sigma[frame.measured] = search.marker_sigma(best)
     weight = frame.simulator.weight
     # With the assumed modulus, the same shape needs forces that are larger by the ratio of the moduli.
     force = np.exp(-best.log_modulus) * (weight + best.force) - weight
-    return InitialState(best.q, force, np.sqrt(3.0) * _rms(frame, best.residual), best.pose)
+    return InitialState(best.q, force, np.sqrt(3.0) * _rms(frame, best.residual), best.pose, marker_sigma)
 
 
 def _softened(frame: FirstFrame, log_modulus: float) -> FirstFrame:
@@ -247,10 +254,7 @@ class _LevenbergMarquardt:
 
     def _normal_equations(self, current: _Estimate) -> tuple[Array, Array]:
         """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, the pose (6) or log E."""
-        jacobian = marker_jacobian(current.frame, current.q)
-        if self.with_modulus:
-            by_modulus = self.frame.along_axes(modulus_slope(current.frame, current.q, current.force))
-            jacobian = np.concatenate([jacobian, by_modulus.reshape(-1, 1)], axis=1)
+        jacobian = self._marker_slopes(current)
         if self.with_pose:
             posed = current.pose.apply(self.frame.target[self.frame.measured])
             jacobian = np.concatenate([jacobian, -pose_jacobian(posed).reshape(-1, 6)], axis=1)
@@ -263,6 +267,25 @@ class _LevenbergMarquardt:
             gradient[-1] += current.log_modulus / MODULUS_SIGMA**2
             hessian[-1, -1] += MODULUS_SIGMA**-2.0
         return gradient, hessian
+
+    def _marker_slopes(self, current: _Estimate) -> Array:
+        """Derivatives of the measured markers, along their axes, by forces and, if fitted, log E, (3 M', 3 L [+ 1])."""
+        slopes = marker_jacobian(current.frame, current.q)
+        if self.with_modulus:
+            by_modulus = self.frame.along_axes(modulus_slope(current.frame, current.q, current.force))
+            slopes = np.concatenate([slopes, by_modulus.reshape(-1, 1)], axis=1)
+        return slopes
+
+    def marker_sigma(self, found: _Estimate) -> Array:
+        """Largest standard deviations of the measured markers [m], (M'), in a fit without a pose.
+
+        By Laplace's approximation: the covariance of forces and log E is the inverse of the Gauss-Newton Hessian.
+        """
+        slopes = self._marker_slopes(found)
+        by_unknowns = slopes.reshape(-1, 3, slopes.shape[1])
+        solved = np.linalg.solve(self._normal_equations(found)[1], slopes.T).T.reshape(by_unknowns.shape)
+        sigma: Array = np.sqrt(np.linalg.eigvalsh(by_unknowns @ solved.swapaxes(1, 2))[:, -1])
+        return sigma
 
     def _damping_matrix(self, hessian: Array) -> Array:
         """The prior of the forces; for the pose, which has no prior, a small multiple of its Hessian diagonal."""

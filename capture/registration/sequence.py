@@ -57,4 +57,5 @@ def fit_by_sequence(frame: FirstFrame, iterations: int = ITERATIONS) -> InitialS
         optimiser.step()
     final = frame.along_axes((frame.markers.positions(found[0])[measured] - target).numpy())[frame.observed_axes]
     rms_distance = float(np.sqrt((final**2).mean() * 3.0))
-    return InitialState(found[0].numpy(), found[1].numpy(), rms_distance, IDENTITY)
+    unknown = np.full(len(frame.target), np.nan)
+    return InitialState(found[0].numpy(), found[1].numpy(), rms_distance, IDENTITY, unknown)

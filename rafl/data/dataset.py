@@ -78,6 +78,11 @@ class Trajectory:
     attributes: dict[str, object] = field(default_factory=dict)
     views: dict[str, View] = field(default_factory=dict)
 
+    @property
+    def has_pixels(self) -> bool:
+        """Whether a camera saw a marker."""
+        return any(bool(view.seen.any()) for view in self.views.values())
+
     def first_frames(self, frames: int) -> "Trajectory":
         """The recording with only its leading frames."""
         arrays = {key: getattr(self, key)[:frames] for key in ("time", "markers", "valid", "sigma")}
@@ -178,11 +183,14 @@ class Dataset:
         _require(bool(np.isfinite(observed).all()), f"{label}/markers", "finite positions where valid")
         _require(bool((item.sigma[item.valid] > 0).all()), f"{label}/sigma", "more than 0 where valid")
         _require(item.split in SPLITS, f"{label}, split", f"{', '.join(SPLITS)}, found {item.split!r}")
-        check_names(item.views)
+        try:
+            check_names(item.views)
+        except ValueError as reason:
+            raise ValueError(f"{label}/views: {reason}") from None
         for camera, view in item.views.items():
             own = f"{label}/views/{camera}"
             _check_arrays(f"{own}/", vars(view), VIEW_ARRAYS, {**lengths, "T": frames})
-            view.check(own)
+            view.check(own, np.where(item.valid[..., None], item.markers, np.nan))
             near = np.abs(view.lag) <= MAX_LAG * self.simulator.time_step
             _require(bool(near.all()), f"{own}/lag", f"times within {MAX_LAG:g} frames of the recording's")
 

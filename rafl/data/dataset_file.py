@@ -18,7 +18,7 @@ from rafl.common.errors import InputError
 from rafl.common.hdf5_files import read_hdf5, write_hdf5
 from rafl.common.names import require_names
 from rafl.common.version import VERSION
-from rafl.common.yaml_files import check_format
+from rafl.common.yaml_files import check_format, describe_validation
 from rafl.data.dataset import (
     INITIAL_ARRAYS,
     MARKER_ARRAYS,
@@ -37,11 +37,11 @@ from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-FORMAT = "rafl-dataset/2"  # 2: with views
+FORMAT = "rafl-dataset/3"  # 2: with views; 3: also of a moving clamp
 UNITS = "SI: m, s, kg, N, Pa; specimen frame: origin at a corner of the clamped face, x to the tip, z up"
 SPECIMEN_GROUPS = ("mesh", "material", "markers")  # groups that all recordings share
 HASH_ATTRIBUTE = "sha256"
-CALIBRATION = "calibration"  # of a recording's views: the cameras as in calib.yaml, in the specimen frame
+CALIBRATION = "calibration"  # of a recording's views: the cameras as in calib.yaml, in the frame of `View`
 LABEL, ADVICE = "a dataset written by rafl-capture", "build it again"  # in messages about unreadable files
 # Unit and frame of every array, by its name. The hashes cover these texts: changing one breaks updates of older files.
 UNITS_AND_FRAMES = {
@@ -66,6 +66,8 @@ UNITS_AND_FRAMES = {
     "pixel": ("px", "image; (0, 0) is the centre of its first pixel"),
     "covariance": ("px2", "image"),
     "lag": ("s", "from the row's time on"),
+    "rotation": ("1", "calibration to specimen, when the camera measured"),
+    "translation": ("m", "specimen"),
 }
 
 
@@ -151,7 +153,7 @@ def _write(file: h5py.File, dataset: Dataset, recipe: str) -> None:
         for key in INITIAL_ARRAYS:
             _write_array(file, f"trajectories/{name}/initial/{key}", getattr(item, key))
         for camera, view in item.views.items():
-            for key in VIEW_ARRAYS:
+            for key in (key for key in VIEW_ARRAYS if getattr(view, key) is not None):
                 _write_array(file, f"trajectories/{name}/views/{camera}/{key}", getattr(view, key))
         if item.views:
             rig = Rig({camera: view.camera for camera, view in item.views.items()})
@@ -300,23 +302,31 @@ class _RecordingAttributes(pydantic.BaseModel):
 
 def _read_trajectory(group: h5py.Group, lengths: dict[str, int], label: str) -> Trajectory:
     attributes = _attributes(group)
-    _RecordingAttributes.model_validate(attributes)
+    try:
+        _RecordingAttributes.model_validate(attributes)
+    except pydantic.ValidationError as error:
+        raise ValueError(f"{label[:-1]}, {describe_validation(error)}") from None
     return Trajectory(
         **read_arrays(group, RECORDING_ARRAYS, lengths, label),
         **read_arrays(group["initial"], INITIAL_ARRAYS, lengths, f"{label}initial/"),
         split=attributes.pop("split"),
         attributes=attributes,
-        views=_read_views(group["views"], lengths, f"{label}views/") if "views" in group else {},
+        views=_read_views(group["views"], lengths, f"{label}views") if "views" in group else {},
     )
 
 
 def _read_views(group: h5py.Group, lengths: dict[str, int], label: str) -> dict[str, View]:
     """The views of a recording, by camera."""
-    rig = parse_calibration(str(group.attrs[CALIBRATION]), Path(group.file.filename))
+    if not isinstance(group, h5py.Group) or CALIBRATION not in group.attrs:
+        raise ValueError(f"{label}: expected a group with the attribute {CALIBRATION}, found none")
+    try:
+        rig = parse_calibration(str(group.attrs[CALIBRATION]), Path(group.file.filename))
+    except InputError as error:
+        raise InputError(f"{label}, {CALIBRATION}: {error}") from None
     if set(rig.cameras) != set(group):
-        raise ValueError(f"{label}: expected the cameras {', '.join(rig.cameras)}, found {', '.join(group)}")
+        raise ValueError(f"{label}: expected the cameras {', '.join(rig.cameras)}, found {', '.join(group) or 'none'}")
     return {
-        name: View(camera, **read_arrays(group[name], VIEW_ARRAYS, lengths, f"{label}{name}/"))
+        name: View(camera, **read_arrays(group[name], VIEW_ARRAYS, lengths, f"{label}/{name}/"))
         for name, camera in rig.cameras.items()
     }
 

@@ -15,7 +15,7 @@ from torch import Tensor
 from rafl.calibration.camera import Camera
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset, Trajectory
-from rafl.data.views import MIN_ANGLE, View, at_lags, project, project_slope
+from rafl.data.views import MIN_ANGLE, View, at_lags, leave_moving_frame, project, project_slope
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.rollout import ResidualForce, rollout
 from rafl.simulation.simulator import Simulator
@@ -35,12 +35,14 @@ class CameraTerm:
     """What one camera measured of B recordings, padded to the longest.
 
     Attributes:
-        cameras: in the specimen frame of each recording, (B).
+        cameras: of each recording, (B), as in `View`.
         pixel: (T, B, M, 2) [px], zero where not seen.
         root: inverse square root of the pixels' covariances times the dataset's reference sigma [m/px], (T, B, M, 2,
             2), zero where not seen. It turns a difference of pixels into a distance in the body.
         lag: of the measurements [time steps], (T, B).
         scale: of the image at the markers [px/m], (T, B, M); 1 where not seen.
+        rotation, translation: of the specimen frame, as in `View`, (T, B, 3, 3) and [m], (T, B, 3); those of the
+            identity where it is at rest.
     """
 
     cameras: list[Camera]
@@ -48,6 +50,8 @@ class CameraTerm:
     root: Tensor
     lag: Tensor
     scale: Tensor
+    rotation: Tensor
+    translation: Tensor
 
     @property
     def seen(self) -> Tensor:
@@ -56,13 +60,20 @@ class CameraTerm:
 
     def index(self, frames: slice, recordings: list[int] | slice, markers: NDArray[np.int64] | slice) -> "CameraTerm":
         """The measurements of some frames, recordings and markers."""
+        by_frame = {key: getattr(self, key)[frames][:, recordings] for key in ("lag", "rotation", "translation")}
         chosen = {key: getattr(self, key)[frames][:, recordings][:, :, markers] for key in ("pixel", "root", "scale")}
         cameras = self.cameras[recordings] if isinstance(recordings, slice) else [self.cameras[b] for b in recordings]
-        return CameraTerm(cameras, lag=self.lag[frames][:, recordings], **chosen)
+        return CameraTerm(cameras, **by_frame, **chosen)
 
     def gap(self, markers: Tensor) -> Tensor:
         """Simulated minus measured pixels, (T, B, M, 2), of simulated markers (T, B, M, 3) [m]."""
-        return project(at_lags(markers, self.lag), self.cameras) - self.pixel
+        measured = at_lags(markers, self.lag)
+        return project(leave_moving_frame(measured, self.rotation, self.translation), self.cameras) - self.pixel
+
+    def slope(self, markers: Tensor) -> Tensor:
+        """Derivatives of the pixels by the markers when the camera measured [px/m], (T, B, M, 2, 3)."""
+        at_rest = leave_moving_frame(markers, self.rotation, self.translation)
+        return project_slope(at_rest, self.cameras) @ self.rotation.mT[:, :, None]
 
 
 @dataclass(frozen=True)
@@ -113,9 +124,9 @@ class Recordings:
             valid[: len(item.time), b] = item.valid
             own = (median / np.maximum(item.sigma, MIN_RELATIVE_SIGMA * median)) ** 2 if by_sigma else 1.0
             weight[: len(item.time), b] = item.valid[..., None] * own
-        with_views = all(item.views for item in items)
-        if objective == "image" and not with_views:
-            lacking = next(name for name, item in zip(names, items, strict=True) if not item.views)
+        with_pixels = all(item.has_pixels for item in items)
+        if objective == "image" and not with_pixels:
+            lacking = next(name for name, item in zip(names, items, strict=True) if not item.has_pixels)
             raise InputError(
                 f"{dataset.name}, recording {lacking}: expected the pixels that its cameras measured, found positions "
                 "only; build the dataset again from tracks, or compare positions with --objective 3d"
@@ -123,7 +134,7 @@ class Recordings:
         stacked = [torch.from_numpy(array) for array in (markers, valid, weight)]
         infinite = torch.full((len(names),), torch.inf, dtype=torch.float64)
         found = cls(dataset, names, stacked[0], stacked[1], stacked[2], {}, infinite)
-        if not with_views:
+        if not with_pixels:
             return found
         reference = _reference_sigma(dataset)
         least = torch.tensor((MIN_HUBER_SIGMAS * reference) ** 2, dtype=torch.float64)
@@ -181,6 +192,14 @@ class Recordings:
         return torch.stack([term.seen for term in self.terms.values()]).amax(0)
 
     @property
+    def located(self) -> Tensor:
+        """1 where the position of a marker was measured, if there are pixels by several cameras, else 0, (T, B, M)."""
+        if not self.terms:
+            return self.valid
+        several = torch.stack([term.seen for term in self.terms.values()]).sum(0) > 1
+        return self.valid * several
+
+    @property
     def observed_coordinates(self) -> float:
         """Number of coordinates after the first frame that the loss compares."""
         if self.in_image:
@@ -216,9 +235,8 @@ class Recordings:
             return [slope * self.weight.sqrt()[:, None]]
         result = []
         for term in self.terms.values():
-            lagging = at_lags(simulated, term.lag)
             own = torch.stack([at_lags(slope[:, k], term.lag) for k in range(slope.shape[1])], dim=1)
-            change = project_slope(lagging, term.cameras)[:, None] @ own[..., None]
+            change = term.slope(at_lags(simulated, term.lag))[:, None] @ own[..., None]
             result.append((term.root[:, None] @ change)[..., 0])
         return result
 
@@ -227,9 +245,10 @@ class Recordings:
         if not self.in_image:
             return self.valid[frame][..., None, None] * torch.eye(3, dtype=torch.float64)
         information = torch.zeros((*self.valid[frame].shape, 3, 3), dtype=torch.float64)
-        for term in self.terms.values():
-            slope = project_slope(self.markers[frame][None], term.cameras)[0] / term.scale[frame][..., None, None]
-            information += (term.seen * self.valid)[frame][..., None, None] * (slope.mT @ slope)
+        one = slice(frame, frame + 1)
+        for term in (term.index(one, slice(None), slice(None)) for term in self.terms.values()):
+            slope = (term.slope(self.markers[one]) / term.scale[..., None, None])[0]
+            information += (term.seen[0] * self.valid[frame])[..., None, None] * (slope.mT @ slope)
         values, vectors = torch.linalg.eigh(information)
         known = (values > MIN_ANGLE**2 * values[..., 1:2]) & (values[..., 1:2] > 0.0)
         projection: Tensor = vectors @ (known[..., None] * vectors.mT)
@@ -242,13 +261,6 @@ def _median_sigma(dataset: Dataset) -> float:
     return float(np.median(sigma[np.isfinite(sigma)]))
 
 
-def _scale(view: View, markers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scale of the image at markers (T, M, 3) [px/m], (T, M)."""
-    slope = view.camera.jacobian(markers)
-    scale: NDArray[np.float64] = np.linalg.det(slope @ slope.swapaxes(-1, -2)) ** 0.25
-    return scale
-
-
 def _image_sigma(view: View) -> NDArray[np.float64]:
     """Standard deviation of a pixel, the geometric mean of both directions [px], (T, M); NaN where not seen."""
     with np.errstate(invalid="ignore"):
@@ -259,7 +271,7 @@ def _image_sigma(view: View) -> NDArray[np.float64]:
 def _reference_sigma(dataset: Dataset) -> float:
     """Median over a dataset of the pixels' sigmas, as distances in the body [m]."""
     sigmas = [
-        (_image_sigma(view) / _scale(view, _known(item)))[view.seen]
+        (_image_sigma(view) / view.scale(_known(item)))[view.seen]
         for item in dataset.trajectories.values()
         for view in item.views.values()
     ]
@@ -277,14 +289,15 @@ def _camera_terms(dataset: Dataset, items: list[Trajectory], frames: int, refere
     for name in dict.fromkeys(name for item in items for name in item.views):
         pixel, root = np.zeros((frames, len(items), count, 2)), np.zeros((frames, len(items), count, 2, 2))
         lag, scale = np.zeros((frames, len(items))), np.ones((frames, len(items), count))
-        cameras = []
+        rotation = np.broadcast_to(np.eye(3), (frames, len(items), 3, 3)).copy()
+        translation, cameras = np.zeros((frames, len(items), 3)), []
         for b, item in enumerate(items):
             view = item.views.get(name)
             cameras.append(next(iter(item.views.values())).camera if view is None else view.camera)
             if view is None:
                 continue
             length, seen = len(item.time), view.seen
-            own = _scale(view, _known(item))
+            own = view.scale(_known(item))
             least = (MIN_RELATIVE_SIGMA * reference * own) ** 2
             values, vectors = np.linalg.eigh(np.where(seen[..., None, None], view.covariance, np.eye(2)))
             inverse = reference / np.sqrt(np.maximum(values, least[..., None]))
@@ -293,7 +306,10 @@ def _camera_terms(dataset: Dataset, items: list[Trajectory], frames: int, refere
             pixel[:length, b] = np.where(seen[..., None], view.pixel, 0.0)
             lag[:length, b] = view.lag / dataset.simulator.time_step
             scale[:length, b] = own
-        result[name] = CameraTerm(cameras, *(torch.from_numpy(array) for array in (pixel, root, lag, scale)))
+            if view.rotation is not None:
+                rotation[:length, b], translation[:length, b] = view.rotation, view.translation
+        arrays = pixel, root, lag, scale, rotation, translation
+        result[name] = CameraTerm(cameras, *(torch.from_numpy(array) for array in arrays))
     return result
 
 
@@ -368,7 +384,7 @@ def marker_distances(recordings: Recordings, simulated: Tensor) -> Tensor:
         in_image = torch.zeros_like(distance)
         for term in recordings.terms.values():
             in_image += term.seen * torch.linalg.norm(term.gap(simulated), dim=-1) / term.scale
-        distance = torch.where((count > 1) & (recordings.valid > 0), distance, in_image / count.clamp_min(1.0))
+        distance = torch.where(recordings.located > 0, distance, in_image / count.clamp_min(1.0))
     return torch.where(recordings.observed > 0, distance, torch.nan)
 
 

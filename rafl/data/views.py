@@ -16,11 +16,19 @@ Array = NDArray[Any]
 
 # Cameras whose lines of sight differ by less than this [rad] do not show a marker's position along them.
 MIN_ANGLE = 0.1
+MAX_PIXEL = 1e6  # no image is larger [px]
 VIEW_ARRAYS = {
-    "pixel": ArrayFormat(("T", "M", 2), finite=False),
+    "pixel": ArrayFormat(("T", "M", 2), finite=False, low=-MAX_PIXEL, high=MAX_PIXEL),
     "covariance": ArrayFormat(("T", "M", 2, 2), finite=False),
     "lag": ArrayFormat(("T",)),
+    "rotation": ArrayFormat(("T", 3, 3), optional=True),
+    "translation": ArrayFormat(("T", 3), optional=True),
 }
+MAX_ROTATION_ERROR = 1e-6  # of the elements of R^T R - 1
+# What measurements of a camera can be; others are damage.
+MIN_SIGMA, MAX_SIGMA = 1e-6, 1e6  # of a pixel [px]
+MIN_SCALE, MAX_SCALE = 1.0, 1e9  # of an image at a marker [px/m]
+MAX_GAP = 0.25  # between a pixel and the projection of the marker's position, as a share of the image's diagonal
 
 
 @dataclass(frozen=True)
@@ -28,16 +36,20 @@ class View:
     """What one camera measured of the markers of one recording.
 
     Attributes:
-        camera: in the specimen frame.
+        camera: in the specimen frame, or, if the clamp moves and the specimen frame with it, in a frame at rest.
         pixel: (T, M, 2), NaN where not seen.
         covariance: of the pixels [px^2], (T, M, 2, 2), NaN where not seen.
         lag: time at which this camera measured minus that of the recording's frame [s], (T).
+        rotation, translation: of a moving specimen frame when this camera measured: a point X in the frame at rest has
+            the coordinates R X + t in it, (T, 3, 3) and [m], (T, 3); None if the specimen frame is at rest.
     """
 
     camera: Camera
     pixel: Array
     covariance: Array
     lag: Array
+    rotation: Array | None = None
+    translation: Array | None = None
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -54,16 +66,95 @@ class View:
 
     def select_frames(self, chosen: slice) -> "View":
         """The measurements in some frames."""
-        return replace(self, pixel=self.pixel[chosen], covariance=self.covariance[chosen], lag=self.lag[chosen])
+        arrays: dict[str, Any] = {key: getattr(self, key) for key in VIEW_ARRAYS if getattr(self, key) is not None}
+        return replace(self, **{key: array[chosen] for key, array in arrays.items()})
 
-    def check(self, label: str) -> None:
-        """Raise ValueError unless every pixel that was seen has a covariance, and the lags are small."""
+    def project(self, points: Array) -> Array:
+        """Pixels (T, M, 2) of points (T, M, 3) [m] in the specimen frame, or (M, 3) for all frames."""
+        return self.camera.project(self._at_rest(points))
+
+    def jacobian(self, points: Array) -> Array:
+        """Derivatives of `project` by the points [px/m], (T, M, 2, 3)."""
+        slope = self.camera.jacobian(self._at_rest(points))
+        return slope if self.rotation is None else slope @ self.rotation.swapaxes(1, 2)[:, None]
+
+    def _at_rest(self, points: Array) -> Array:
+        """Points (T, M, 3) in the camera's frame."""
+        if self.rotation is None or self.translation is None:
+            return np.broadcast_to(points, (len(self.pixel), *points.shape[-2:]))
+        at_rest: Array = leave_moving_frame(points, self.rotation, self.translation)
+        return at_rest
+
+    def without_motion(self, near: Array) -> "View":
+        """The view as if the specimen frame had stayed where it was in the first frame.
+
+        near: positions [m], (M, 3), for which the pixels are exact; elsewhere to first order.
+        """
+        if self.rotation is None or self.translation is None:
+            return self
+        camera = self.camera.in_frame(self.rotation[0], self.translation[0])
+        pixel = self.pixel + (camera.project(near) - self.project(near))
+        return replace(self, camera=camera, pixel=pixel, rotation=None, translation=None)
+
+    def scale(self, points: Array) -> Array:
+        """Scale of the image at points (T, M, 3) [px/m], the geometric mean of both directions, (T, M)."""
+        slope = self.jacobian(points)
+        scale: Array = np.linalg.det(slope @ slope.swapaxes(-1, -2)) ** 0.25
+        return scale
+
+    def check(self, label: str, positions: Array) -> None:
+        """Check that the values are such as a camera measures.
+
+        Args:
+            label: begins the messages.
+            positions: of the markers [m], (T, M, 3), NaN where not known.
+
+        Raises:
+            ValueError: a pixel has no covariance, a rotation does not only turn, or the camera shows the markers
+                elsewhere.
+        """
+        if not (np.isfinite(self.pixel) == self.seen[..., None]).all() or np.isinf(self.pixel).any():
+            raise ValueError(f"{label}/pixel: expected two finite numbers, or two NaN where a marker is not seen")
         own = self.covariance[self.seen]
         symmetric = np.isfinite(own).all() and np.allclose(own, own.swapaxes(1, 2), rtol=1e-6)
-        if not symmetric or (len(own) and np.linalg.eigvalsh(own).min() <= 0.0):
-            raise ValueError(f"{label}/covariance: expected a positive definite matrix for every pixel")
-        if not np.isfinite(self.pixel[self.seen]).all():
-            raise ValueError(f"{label}/pixel: expected two finite numbers where a marker is seen")
+        variances = np.linalg.eigvalsh(own) if symmetric else np.zeros(1)
+        if not ((variances >= MIN_SIGMA**2) & (variances <= MAX_SIGMA**2)).all():
+            raise ValueError(
+                f"{label}/covariance: expected a positive definite matrix for every pixel, with standard deviations "
+                f"from {MIN_SIGMA:g} to {MAX_SIGMA:g} px"
+            )
+        if (self.rotation is None) != (self.translation is None):
+            raise ValueError(f"{label}: expected both rotation and translation of a moving frame, found one of them")
+        if self.rotation is not None:
+            error = np.abs(self.rotation.swapaxes(1, 2) @ self.rotation - np.eye(3)).max(initial=0.0)
+            if error > MAX_ROTATION_ERROR or (np.linalg.det(self.rotation) < 0.0).any():
+                raise ValueError(f"{label}/rotation: expected rotation matrices")
+        self._check_camera(label, positions)
+
+    def _check_camera(self, label: str, positions: Array) -> None:
+        """Raise ValueError unless the camera shows the positions of seen markers near their pixels."""
+        compared = self.seen & np.isfinite(positions).all(axis=2)
+        with np.errstate(all="ignore"):
+            gap = np.linalg.norm(self.project(positions) - self.pixel, axis=2)[compared]
+            scale = self.scale(positions)[compared]
+        largest = MAX_GAP * float(np.linalg.norm(self.camera.image_size))
+        if not (gap <= largest).all():
+            raise ValueError(
+                f"{label}: expected pixels within {largest:.0f} px of where the calibrated camera shows the markers, "
+                f"found some {gap.max():.3g} px off"
+            )
+        if not ((scale >= MIN_SCALE) & (scale <= MAX_SCALE)).all():
+            raise ValueError(
+                f"{label}: expected a camera that shows the markers with {MIN_SCALE:g} to {MAX_SCALE:g} px/m"
+            )
+
+
+def leave_moving_frame(points: Any, rotation: Any, translation: Any) -> Any:
+    """Points (.., M, 3) of a moving frame in the frame at rest, from which R X + t leads to it. Arrays or tensors.
+
+    rotation, translation: R, (.., 3, 3), and t, (.., 3).
+    """
+    return (points - translation[..., None, :]) @ rotation
 
 
 def seen_axes(views: Mapping[str, View], position: Array) -> tuple[Array, Array]:
@@ -80,7 +171,7 @@ def seen_axes(views: Mapping[str, View], position: Array) -> tuple[Array, Array]
     information = np.zeros((len(position), 3, 3))
     for view in views.values():
         seen = view.seen[0]
-        slope = view.camera.jacobian(position[seen])
+        slope = view.jacobian(position[seen])[0]
         information[seen] += slope.swapaxes(1, 2) @ np.linalg.solve(view.covariance[0, seen], slope)
     values, vectors = np.linalg.eigh(information)
     values, axes = values[:, ::-1], vectors[:, :, ::-1].swapaxes(1, 2)

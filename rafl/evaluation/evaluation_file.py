@@ -36,6 +36,7 @@ RECORDING_ARRAYS = {
 METHOD_ARRAYS = {
     "markers": ArrayFormat(("T", "M", 3)),
     "distances": ArrayFormat(("T", "M"), finite=False, low=0.0),
+    "rest_distances": ArrayFormat(("M",), finite=False, low=0.0, optional=True),  # missing in earlier files
     "vertices": ArrayFormat(("T", "B", 3), optional=True),
     "strain": ArrayFormat(("T", "C"), low=0.0, optional=True),
     "force": ArrayFormat(("T-1", "B"), low=0.0, optional=True),
@@ -80,6 +81,7 @@ def write_evaluation(path: Path, evaluation: Evaluation) -> None:
                 own["strain_range"] = [item.strains[method].strain, item.strains[method].rate]
                 _write_array(own, "markers", item.simulated[method])
                 _write_array(own, "distances", distances)
+                _write_array(own, "rest_distances", item.rest_distances[method])
                 motion = vars(item.motions[method]) if number in kept else {}
                 for key, value in motion.items():
                     if value is not None:
@@ -159,6 +161,9 @@ def _read(group: h5py.Group, label: str) -> Comparison:
         recorded=found["recorded"],
         simulated={method: own["markers"] for method, own in methods.items()},
         distances={method: own["distances"] for method, own in methods.items()},
+        rest_distances={
+            method: own.get("rest_distances", np.full(lengths["M"], np.nan)) for method, own in methods.items()
+        },
         marker_names=found["marker_names"],
         surface=Surface(found["faces"], found["cells"]),
         motions={method: _motion(own) for method, own in methods.items() if all(bodies)},

@@ -12,7 +12,8 @@ from rafl.common.errors import SimulationError
 from rafl.data.dataset import SPLITS, Dataset
 from rafl.data.objective import Recordings, marker_distances
 from rafl.data.strain_range import StrainRange
-from rafl.evaluation.oscillation import fit_oscillation, most_active_coordinate, rest_position_error
+from rafl.evaluation.oscillation import fit_oscillation, most_active_coordinate
+from rafl.evaluation.rest_position import rest_distances
 from rafl.evaluation.surface import Surface, SurfaceMotion
 from rafl.fitting.run_folder import FittedModel
 
@@ -30,6 +31,8 @@ class Comparison:
         simulated: by method, marker positions [m], (T, M, 3).
         distances: by method, distances of the markers from what was seen of them [m], (T, M), NaN where nothing was;
             see `rafl.data.objective.marker_distances`.
+        rest_distances: by method, distances between simulated and recorded rest positions [m], (M), NaN for markers not
+            seen at the end; see `rafl.evaluation.rest_position`.
         marker_names: (M).
         surface: boundary of the specimen's mesh.
         motions: by method, the motion of that boundary; empty where it was not kept.
@@ -43,6 +46,7 @@ class Comparison:
     recorded: NDArray[np.float64]
     simulated: dict[str, NDArray[np.float64]]
     distances: dict[str, NDArray[np.float64]]
+    rest_distances: dict[str, NDArray[np.float64]]
     marker_names: tuple[str, ...]
     surface: Surface
     motions: dict[str, SurfaceMotion]
@@ -75,7 +79,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
     names = list(dataset.trajectories)
     recordings = Recordings.of(dataset, names)
     mesh, lengths = dataset.simulator.mesh, [len(dataset.trajectories[name].time) for name in names]
-    simulated, distances, motions, strains = {}, {}, {}, {}
+    simulated, distances, at_rest, motions, strains = {}, {}, {}, {}, {}
     with torch.no_grad():
         for method, model in {BASELINE: FittedModel(BASELINE), **models}.items():
             simulator = model.simulator(dataset.simulator)
@@ -92,6 +96,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
                 StrainRange.of(simulator.mesh, q[:, b : b + 1], simulator.time_step) for b in range(len(names))
             ]
             distances[method] = marker_distances(recordings, markers).numpy()
+            at_rest[method] = rest_distances(recordings, markers)
     result, surface = [], Surface.of(mesh)
     for b, name in enumerate(names):
         item = dataset.trajectories[name]
@@ -104,6 +109,7 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
                 np.where(item.valid[..., None], item.markers, np.nan),
                 {method: markers[: len(item.time), b] for method, markers in simulated.items()},
                 {method: values[: len(item.time), b] for method, values in distances.items()},
+                {method: values[b] for method, values in at_rest.items()},
                 dataset.markers.names,
                 surface,
                 {method: values[b] for method, values in motions.items()},
@@ -208,6 +214,7 @@ def motion_table(comparisons: list[Comparison]) -> pd.DataFrame:
         marker, axis = most_active_coordinate(item.recorded)
         for method, markers in {"recorded": item.recorded, **item.simulated}.items():
             fitted = fit_oscillation(item.time, markers[:, marker, axis])
+            final = item.rest_distances.get(method, np.zeros(1))  # of the recording itself
             rows.append(
                 {
                     "dataset": item.dataset,
@@ -216,7 +223,7 @@ def motion_table(comparisons: list[Comparison]) -> pd.DataFrame:
                     "method": method,
                     "frequency_hz": fitted.frequency,
                     "damping_ratio": fitted.damping,
-                    "final_error_mm": 1e3 * rest_position_error(item.recorded, markers),
+                    "final_error_mm": 1e3 * final[seen].mean() if (seen := np.isfinite(final)).any() else np.nan,
                 }
             )
     return pd.DataFrame(rows)

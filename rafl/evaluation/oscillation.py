@@ -1,4 +1,4 @@
-"""Frequency, damping and rest position of a marker whose oscillation decays."""
+"""Frequency and damping of a marker whose oscillation decays."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -9,7 +9,7 @@ from scipy.optimize import OptimizeWarning, curve_fit
 
 Array = NDArray[Any]
 
-REST_SHARE = 0.1  # share of the recording, at its end, in which the markers count as at rest
+REST_SHARE = 0.1  # share of a recording, at its end, in which the markers count as at rest
 MIN_EXPLAINED_VARIANCE = 0.9  # share of the variance; below it a motion is not a damped oscillation
 MIN_FRAMES = 12  # known frames that the fit needs
 
@@ -74,17 +74,3 @@ def most_active_coordinate(markers: Array) -> tuple[int, int]:
     motion_range = np.fmax.reduce(markers, axis=0) - np.fmin.reduce(markers, axis=0)  # NaN of a marker never seen
     marker, axis = np.unravel_index(np.nanargmax(motion_range), motion_range.shape)
     return int(marker), int(axis)
-
-
-def rest_position_error(recorded: Array, simulated: Array) -> float:
-    """Mean distance [m] between the rest positions of recorded and simulated markers, both (T, M, 3) [m].
-
-    A rest position is the mean over the last tenth of the recording. Markers not seen there do not count; NaN if none
-    is seen.
-    """
-    last = max(int(REST_SHARE * len(recorded)), 1)
-    seen = np.isfinite(recorded[-last:, :, 0])
-    count = np.maximum(seen.sum(0), 1)[:, None]
-    offset = np.where(seen[..., None], simulated[-last:] - recorded[-last:], 0.0).sum(0) / count
-    distance = np.linalg.norm(offset, axis=1)[seen.any(0)]
-    return float(distance.mean()) if len(distance) else np.nan

@@ -71,6 +71,7 @@ class PageData:
                 recorded=np.where(item.valid[..., None], item.markers, np.nan),
                 simulated={},
                 distances={},
+                rest_distances={},
                 marker_names=dataset.markers.names,
                 surface=surface,
                 motions={"body of the first frame": SurfaceMotion.of(mesh, item.q[None])},

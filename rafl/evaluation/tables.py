@@ -113,7 +113,8 @@ def _motion_table(motions: pd.DataFrame) -> dict[str, Any]:
         "title": "Frequency, damping, rest position",
         "note": "Frequency and damping of the coordinate with the largest range of motion. A dash means that its "
         "motion is not a damped oscillation. Final error: mean distance between the simulated and recorded rest "
-        "positions of all markers. A rest position is the mean over the last tenth of the recording.",
+        "positions of all markers, in the image for those that a single camera saw. A rest position is the mean over "
+        "the last tenth of the recording.",
         "columns": ["dataset", "recording", "method", "frequency [Hz]", "damping ratio", "final error [mm]"],
         "rows": rows,
     }

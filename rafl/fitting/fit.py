@@ -111,11 +111,11 @@ def fit(
 
 def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify: Callable[[str], None]) -> None:
     """Report pixels that are not compared, processes that get no recording, and pre-training that cannot be done."""
-    with_views = [[bool(item.views) for item in dataset.trajectories.values()] for dataset in datasets]
+    with_pixels = [[item.has_pixels for item in dataset.trajectories.values()] for dataset in datasets]
     in_space = settings.objective == "3d"
-    if settings.by_sigma and not in_space and all(all(each) for each in with_views):
+    if settings.by_sigma and not in_space and all(all(each) for each in with_pixels):
         notify("--by-sigma has no effect: pixels are weighted by their covariance; it is for --objective 3d")
-    for dataset, each in zip(datasets, with_views, strict=True):
+    for dataset, each in zip(datasets, with_pixels, strict=True):
         if any(each) and not all(each) and not in_space:
             notify(
                 f"{dataset.name}: some recordings have no pixels; where they are compared together with others, "

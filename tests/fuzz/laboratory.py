@@ -1,6 +1,7 @@
 """A small laboratory: one good file of every format that the commands read."""
 
 import io
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import stereo
 import torch
 import trimesh
 import yaml
+from filmed_markers import filmed, pinhole_camera, side_camera
 from support import SMALL_SPECIMEN, draw_frame
 
 from rafl.batch.state import Book, State, Status
@@ -139,7 +141,7 @@ def _write_motions(folder: Path) -> None:
             write(path, tracks, {})
         write_tracks(folder / "tracks" / f"{name}.h5", tracks)
     _write_corrections(folder / "tracks" / "take1.h5")
-    write_dataset(folder / "data.h5", _dataset(specimen.simulator(0.01), markers, starts, positions))
+    write_dataset(folder / "data.h5", _filmed(_dataset(specimen.simulator(0.01), markers, starts, positions)))
     save_model(folder / "field", FittedModel("rafl", ResidualField(), {"youngs_modulus": 160e3}))
 
 
@@ -194,6 +196,13 @@ def _dataset(simulator: Simulator, markers: Markers, starts: np.ndarray, positio
         for k, (name, load) in enumerate(LOADS.items())
     }  # fmt: skip
     return Dataset("small", simulator, markers, items, "of a test")
+
+
+def _filmed(dataset: Dataset) -> Dataset:
+    """The dataset with the pixels of two cameras; the clamp of the last recording moves."""
+    cameras = {"left": side_camera(0.3, (0.02, -0.01)), "pin": pinhole_camera(0.5)}
+    last, found = list(LOADS)[-1], filmed(dataset, cameras).trajectories
+    return replace(dataset, trajectories=found | {last: filmed(dataset, cameras, moving=True).trajectories[last]})
 
 
 def _camera() -> OrthographicCamera:

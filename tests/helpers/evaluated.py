@@ -51,6 +51,9 @@ def make_comparison(
         recorded=recorded,
         simulated=simulated,
         distances={method: np.linalg.norm(markers - recorded, axis=-1) for method, markers in simulated.items()},
+        rest_distances={
+            method: np.linalg.norm((markers - recorded)[-4:].mean(0), axis=-1) for method, markers in simulated.items()
+        },
         marker_names=tuple(f"m{number}" for number in range(len(MARKED))),
         surface=Surface.of(MESH),
         motions={

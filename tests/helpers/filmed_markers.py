@@ -40,27 +40,39 @@ def pinhole_camera(distance: float) -> PinholeCamera:
     )
 
 
+def frame_motion(frames: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (T, 3, 3) and translations [m], (T, 3), from a frame at rest to one that turns and shifts."""
+    time = np.linspace(0.0, 1.0, frames)[:, None]
+    turn = Rotation.from_rotvec(0.1 * time * [0.5, 0.7, -0.5]).as_matrix()
+    return turn, time**2 * [0.003, -0.002, 0.004]
+
+
 def filmed(
     dataset: Dataset,
     cameras: Mapping[str, Camera],
     sigma: float = 0.02,
     noise: np.random.Generator | None = None,
+    moving: bool = False,
 ) -> Dataset:
     """The dataset with what the cameras see of all valid markers.
 
     Args:
         dataset: with positions.
-        cameras: in the specimen frame.
+        cameras: in the specimen frame where it starts.
         sigma: of the pixels [px].
         noise: adds errors of this sigma to the pixels; none if None.
+        moving: whether the specimen frame turns by 6 degrees and shifts by 5 mm.
     """
 
     def view(camera: Camera, item: Trajectory) -> View:
-        pixel = camera.project(item.markers)
+        rotation, translation = frame_motion(len(item.time))
+        seen = np.einsum("tji,tmj->tmi", rotation, item.markers - translation[:, None]) if moving else item.markers
+        pixel = camera.project(seen)
         if noise is not None:
             pixel = pixel + noise.normal(0.0, sigma, pixel.shape)
         covariance = np.where(item.valid[..., None, None], sigma**2 * np.eye(2), np.nan)
-        return View(camera, np.where(item.valid[..., None], pixel, np.nan), covariance, np.zeros(len(item.time)))
+        found = View(camera, np.where(item.valid[..., None], pixel, np.nan), covariance, np.zeros(len(item.time)))
+        return replace(found, rotation=rotation, translation=translation) if moving else found
 
     return replace(
         dataset,

@@ -43,6 +43,7 @@ def test_missing_markers_and_unobserved_axes_are_ignored(small_specimen: Specime
     found = fit_first_frame(FirstFrame(simulator, markers, small_specimen.loaded, target, sigma, "test"))
     assert np.linalg.norm(found.q - truth, axis=1).max() < 2e-4
     assert found.residual < 5e-5
+    assert np.isnan(found.marker_sigma).all()  # E is assumed
 
 
 @pytest.mark.parametrize("local", [0.0, 0.03])

@@ -8,6 +8,7 @@ import h5py
 import numpy as np
 import pytest
 from energies import gent
+from filmed_markers import filmed, side_camera
 
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
@@ -292,7 +293,7 @@ def test_attributes_that_are_no_such_numbers_are_refused(
     read_dataset(path)
     with h5py.File(path, "r+") as file:
         file["trajectories/a"].attrs[key] = value
-    with pytest.raises(InputError, match=f"which cannot be read: {key}: "):
+    with pytest.raises(InputError, match=f"which cannot be read: trajectories/a, {key}: "):
         read_dataset(path)
 
 
@@ -317,7 +318,8 @@ for _ in range(50):
 def test_killed_writers_leave_the_file_intact(dataset: Dataset, tmp_path: Path) -> None:
     """A process that rewrites the file repeatedly is killed at random times; the file is intact each time."""
     path = tmp_path / "a.h5"
-    trajectories = {f"r{k}": dataset.trajectories["a"] for k in range(8)}
+    with_views = filmed(dataset, {"left": side_camera(0.0)}, moving=True)
+    trajectories = {f"r{k}": with_views.trajectories["a"] for k in range(8)}
     write_dataset(path, replace(dataset, trajectories=trajectories))
     result = subprocess.run([sys.executable, "-c", KILL_WRITERS, str(path)], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines() == ["[]"] * 50

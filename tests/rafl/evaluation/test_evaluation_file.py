@@ -28,6 +28,7 @@ def test_evaluation_is_read_as_written(tmp_path: Path) -> None:
         assert list(one.motions) == list(other.motions)
         for method, motion in one.motions.items():
             np.testing.assert_allclose(one.distances[method], other.distances[method], rtol=1e-6)
+            np.testing.assert_allclose(one.rest_distances[method], other.rest_distances[method], rtol=1e-6)
             np.testing.assert_array_equal(motion.vertices, other.motions[method].vertices)
             np.testing.assert_array_equal(motion.strain, other.motions[method].strain)
             assert (motion.force is None) == (other.motions[method].force is None)
