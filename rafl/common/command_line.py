@@ -1,6 +1,7 @@
 """Code that all commands share: error reports, application settings, progress bars."""
 
 import functools
+import os
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
@@ -30,24 +31,35 @@ def report_errors(command: Callable[P, R]) -> Callable[P, R]:
             with interruptible():
                 return command(*args, **kwargs)
         except InputError as error:
-            raise _failure(f"error: {error}", 2) from None
+            raise failure(f"error: {error}", 2) from None
         except OSError as error:
             path = error.filename or "a file"
             reason = error.strerror or error
             message = f"error: {path}: {reason}; check the path, its permissions and the space on the disk"
-            raise _failure(message, 2) from None
+            raise failure(message, 2, shared=False) from None
         except MemoryError:
             message = "error: expected more free memory; end other programs, or use fewer recordings or a coarser mesh"
-            raise _failure(message, 2) from None
+            raise failure(message, 2, shared=False) from None
         except KeyboardInterrupt as error:
             message = "interrupted; no incomplete file was left"
-            raise _failure(message, 143 if isinstance(error, Terminated) else 130) from None
+            raise failure(message, 143 if isinstance(error, Terminated) else 130) from None
 
     return wrapped
 
 
-def _failure(message: str, code: int) -> typer.Exit:
-    typer.echo(one_line(message), err=True)
+def failure(message: str, code: int, shared: bool = True) -> typer.Exit:
+    """Report an error in one line on standard error.
+
+    Args:
+        message: to report.
+        code: for the exit.
+        shared: whether all processes that torchrun started raise the error; the first on a machine reports it then.
+
+    Returns:
+        The exit, to be raised.
+    """
+    if not shared or os.environ.get("LOCAL_RANK", "0") == "0":
+        typer.echo(one_line(message), err=True)
     return typer.Exit(code)
 
 
@@ -68,7 +80,7 @@ def create_app(help_text: str) -> typer.Typer:
     )
 
 
-def progress() -> Progress:
+def progress(shown: bool = True) -> Progress:
     """A progress bar on standard error, so that standard output holds results only."""
     return Progress(
         TextColumn("{task.description}", markup=False),
@@ -77,6 +89,7 @@ def progress() -> Progress:
         TimeRemainingColumn(),
         console=Console(stderr=True, markup=False),
         transient=True,
+        disable=not shown,
     )
 
 
