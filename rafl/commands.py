@@ -67,10 +67,11 @@ def fit(
         typer.Exit: a simulation failed, or another process that torchrun started has ended; code 1.
     """
     torch.set_num_threads(TORCH_THREADS)
-    announce_compilation()
+    first = rank() == 0  # of the processes that torchrun started
+    if first:
+        announce_compilation()
     run = out or Path("runs") / _run_name(read_dataset(paths[0]).name, method)
     require_writable(run)
-    first = rank() == 0  # of the processes that torchrun started
     open_writer = partial(_summary_writer(), run) if tensorboard and first else None
     with progress(first) as bar:
         searches = method == "auto" or method in METHOD_QUANTITIES  # of several stages

@@ -2,6 +2,7 @@
 
 import functools
 import os
+import time
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
@@ -16,6 +17,8 @@ from rafl.common.interruption import Terminated, interruptible
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+MAX_WAIT = 60.0  # [s], see `failure`; imports from a slow disk take some
 
 
 def report_errors(command: Callable[P, R]) -> Callable[P, R]:
@@ -41,8 +44,9 @@ def report_errors(command: Callable[P, R]) -> Callable[P, R]:
             message = "error: expected more free memory; end other programs, or use fewer recordings or a coarser mesh"
             raise failure(message, 2, shared=False) from None
         except KeyboardInterrupt as error:
-            message = "interrupted; no incomplete file was left"
-            raise failure(message, 143 if isinstance(error, Terminated) else 130) from None
+            if _is_first():
+                typer.echo("interrupted; no incomplete file was left", err=True)
+            raise typer.Exit(143 if isinstance(error, Terminated) else 130) from None
 
     return wrapped
 
@@ -50,17 +54,27 @@ def report_errors(command: Callable[P, R]) -> Callable[P, R]:
 def failure(message: str, code: int, shared: bool = True) -> typer.Exit:
     """Report an error in one line on standard error.
 
+    Of the processes that torchrun started on this machine, the first reports an error that all raise. The others wait
+    for torchrun to end them once the first has ended; if one of them ended sooner, torchrun would not let the first
+    report. Whoever waits in vain has an error of its own, and reports it.
+
     Args:
         message: to report.
         code: for the exit.
-        shared: whether all processes that torchrun started raise the error; the first on a machine reports it then.
+        shared: whether all processes may raise the error.
 
     Returns:
         The exit, to be raised.
     """
-    if not shared or os.environ.get("LOCAL_RANK", "0") == "0":
-        typer.echo(one_line(message), err=True)
+    if shared and not _is_first():
+        time.sleep(MAX_WAIT)
+    typer.echo(one_line(message), err=True)
     return typer.Exit(code)
+
+
+def _is_first() -> bool:
+    """Whether this is the first of the processes that torchrun started on this machine, or the only one."""
+    return os.environ.get("LOCAL_RANK", "0") == "0"
 
 
 def one_line(text: str) -> str:

@@ -1,12 +1,17 @@
-"""Commands in several processes that form a group, as under torchrun but started faster."""
+"""Commands in several processes that form a group, as under torchrun but started faster.
+
+As torchrun does, the others are terminated when one fails.
+"""
 
 import multiprocessing
 import os
 import socket
 import subprocess
 import tempfile
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
+from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from multiprocessing.reduction import DupFd
 from pathlib import Path
@@ -15,6 +20,7 @@ from typing import Any
 from support import run_console_script
 
 LONGEST = 120  # [s] that a group may take
+INTERRUPTED = 130  # exit code after Ctrl-C, which all processes get
 
 
 def run_member(environment: dict[str, str], line: list[str], folder: Path, out: Any, err: Any) -> None:
@@ -56,9 +62,13 @@ def run_together(
             processes[-1].start()
         try:
             during(processes)
-            for process in processes:
-                process.join(LONGEST)
-                if process.exitcode is None:
+            limit = time.monotonic() + LONGEST
+            while any(process.is_alive() for process in processes):
+                wait([process.sentinel for process in processes if process.is_alive()], 1.0)
+                if any(process.exitcode not in (None, 0, INTERRUPTED) for process in processes):
+                    for process in processes:
+                        process.terminate()
+                if time.monotonic() > limit:
                     raise TimeoutError(f"{words} did not end")
         finally:
             for process in processes:

@@ -118,7 +118,8 @@ def test_simulation_that_fails_in_one_process_ends_all(dataset: Dataset, tmp_pat
     torn = replace(dataset.trajectories["b"], load=np.full_like(dataset.trajectories["b"].load, 1e4))
     write_dataset(tmp_path / "a.h5", replace(dataset, trajectories={**dataset.trajectories, "b": torn}))
     first, second = run_together(2, tmp_path, "rafl-fit", "a.h5", "--method", "sysid", "--out", "run")
-    assert (first.returncode, second.returncode) == (1, 1)
+    assert first.returncode == 1
+    assert second.returncode != 0
     (line,) = error_lines(first.stderr)
     assert line.startswith("error: step 1: trajectory 0 did not converge")
     assert line.endswith("[trajectories: b]")
@@ -126,14 +127,22 @@ def test_simulation_that_fails_in_one_process_ends_all(dataset: Dataset, tmp_pat
     assert not (tmp_path / "run").exists()
 
 
-@pytest.mark.parametrize("options", [("--method", "none"), ("--method", "sysid", "--out", "taken")])
-def test_error_of_the_user_is_printed_once(options: tuple[str, ...], folder: Path) -> None:
-    """An error of the options, which all processes find, and one of the run folder, which only the first sees."""
+@pytest.mark.parametrize(
+    ("options", "part"),
+    [
+        (("--method", "none"), "--method: expected"),
+        (("--each",), "torchrun: expected one fit"),
+        (("--method", "sysid", "--out", "taken"), "already holds a run"),
+    ],
+)
+def test_error_of_the_user_is_printed_once(options: tuple[str, ...], part: str, folder: Path) -> None:
+    """Errors of the options, which all processes find, and one of the run folder, which only the first sees."""
     (folder / "taken").mkdir(exist_ok=True)
     (folder / "taken" / "config.yaml").write_text("format: rafl-run/1\n")
     first, second = run_together(2, folder, "rafl-fit", "a.h5", *options)
-    assert_refused(first, "--method" if len(options) == 2 else "already holds a run")
-    assert (second.returncode, error_lines(second.stderr)) == (2, [])
+    assert_refused(first, part)
+    assert second.returncode != 0
+    assert error_lines(second.stderr) == []
 
 
 def test_interruption_ends_all_processes(folder: Path) -> None:
