@@ -99,7 +99,7 @@ def fit(
 
     Example of several fits at the same time: rafl-fit datasets/*.h5 --each --jobs 2
 
-    Example of one fit by several processes: torchrun --nproc-per-node 2 .venv/bin/rafl-fit datasets/thick.h5
+    Example of one fit by several processes: torchrun --standalone --nproc-per-node 2 --no-python rafl-fit FILE.h5
     """
     given = dict(locals())
     if method not in METHODS:
