@@ -1,5 +1,6 @@
 """The commands `rafl-fit` and `rafl-eval`: their options, and the checks that need no heavy import."""
 
+import os
 from pathlib import Path
 from typing import Annotated
 
@@ -47,7 +48,7 @@ def fit(
     ] = 0,
     seed: Annotated[int, typer.Option(help="Random seed of weights and recording order (rafl, srl).")] = 0,
     batch: Annotated[
-        int, typer.Option(min=1, help="Recordings per update (rafl). Under torchrun the processes share them.")
+        int, typer.Option(min=1, help="Recordings per update (rafl), which the processes of torchrun share.")
     ] = 1,
     force_penalty: Annotated[
         float, typer.Option(min=0.0, help="Penalty on squared residual forces [m2/N2] (rafl).")
@@ -97,6 +98,8 @@ def fit(
     Example: rafl-fit datasets/thick.h5 --out runs/thick
 
     Example of several fits at the same time: rafl-fit datasets/*.h5 --each --jobs 2
+
+    Example of one fit by several processes: torchrun --standalone --nproc-per-node 2 --no-python rafl-fit FILE.h5
     """
     given = dict(locals())
     if method not in METHODS:
@@ -111,6 +114,10 @@ def fit(
         require_file(path, DATASET)
     how = Batch.of(Where.local if each and on is None else on, jobs, cluster, print_commands, status)
     if how.apart:
+        if int(os.environ.get("WORLD_SIZE", "1")) > 1:
+            raise InputError(
+                "torchrun: expected one fit, found --each, --on or --status, which are for many; leave one of them out"
+            )
         from rafl import unit_commands
 
         unit_commands.fit(given, how)

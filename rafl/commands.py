@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from rafl.common.command_line import create_table, progress
+from rafl.common.command_line import create_table, failure, progress
 from rafl.common.errors import InputError, SimulationError
 from rafl.common.files import require_writable, written_files
 from rafl.common.kernels import announce_compilation
@@ -37,7 +37,7 @@ from rafl.evaluation.metrics import (
 from rafl.evaluation.page_data import PageData
 from rafl.evaluation.page_file import page_file
 from rafl.fitting.auto import SELECTION_FILE, selection_sentences
-from rafl.fitting.distributed import rank
+from rafl.fitting.distributed import OtherProcessError, rank
 from rafl.fitting.fit import fit as fit_model
 from rafl.fitting.methods import DEFAULT_EPOCHS
 from rafl.fitting.quantities import METHOD_QUANTITIES, POISSON
@@ -64,23 +64,24 @@ def fit(
 
     Raises:
         InputError: the datasets, the run folder or the options do not fit the method.
-        typer.Exit: a simulation failed; code 1.
+        typer.Exit: a simulation failed, or another process that torchrun started has ended; code 1.
     """
     torch.set_num_threads(TORCH_THREADS)
-    announce_compilation()
+    first = rank() == 0  # of the processes that torchrun started
+    if first:
+        announce_compilation()
     run = out or Path("runs") / _run_name(read_dataset(paths[0]).name, method)
     require_writable(run)
-    first = rank() == 0  # of the processes that torchrun started
     open_writer = partial(_summary_writer(), run) if tensorboard and first else None
-    with progress() as bar:
+    with progress(first) as bar:
         searches = method == "auto" or method in METHOD_QUANTITIES  # of several stages
         task = bar.add_task("epoch", total=None if searches else options["epochs"] or DEFAULT_EPOCHS[method])
-        report = _epoch_report(bar, task, open_writer, first)
+        report = _epoch_report(bar, task, open_writer)
         notify = partial(typer.echo, err=True)
         try:
             model = fit_model(paths, run, method, resume=resume, report=report, notify=notify, **options)
-        except SimulationError as error:
-            raise _failed_simulation(error) from None
+        except (SimulationError, OtherProcessError) as error:
+            raise failure(f"error: {error}", 1) from None
     if not first:
         return
     typer.echo(_describe(model))
@@ -100,7 +101,7 @@ def _run_name(dataset: str, method: str) -> str:
     return f"{dataset}-{method}"
 
 
-def _epoch_report(bar: Progress, task: TaskID, open_writer: Callable[[], Any] | None, first: bool) -> Report:
+def _epoch_report(bar: Progress, task: TaskID, open_writer: Callable[[], Any] | None) -> Report:
     """A function that prints one row of the history and passes it to TensorBoard, whose file the first row opens."""
     writer: Any = None
 
@@ -108,8 +109,6 @@ def _epoch_report(bar: Progress, task: TaskID, open_writer: Callable[[], Any] | 
         nonlocal writer
         kind = "epoch" if "epoch" in row else "warm_start"
         bar.update(task, completed=row.get("epoch", 0))
-        if not first:
-            return
         values = ", ".join(
             f"{LABELS.get(key, key)} {value:.5g}" for key, value in row.items() if key != kind and value == value
         )
@@ -138,11 +137,6 @@ def _summary_writer() -> Any:
             "out (history.csv holds the same values)"
         ) from None
     return SummaryWriter
-
-
-def _failed_simulation(error: SimulationError) -> typer.Exit:
-    typer.echo(f"error: {error}", err=True)
-    return typer.Exit(1)
 
 
 def _describe(model: FittedModel) -> str:
@@ -190,7 +184,7 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool) ->
     try:
         comparisons, failed = _compare_all(datasets, models)
     except SimulationError as error:
-        raise _failed_simulation(error) from None
+        raise failure(f"error: {error}", 1) from None
     recordings, splits, motions = error_table(comparisons), split_table(comparisons), motion_table(comparisons)
     evaluation = Evaluation(comparisons, "; ".join(f"{name}: {_describe(model)}" for name, model in models.items()))
     texts = {

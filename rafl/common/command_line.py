@@ -1,6 +1,8 @@
 """Code that all commands share: error reports, application settings, progress bars."""
 
 import functools
+import os
+import time
 from collections.abc import Callable
 from typing import ParamSpec, TypeVar
 
@@ -16,6 +18,8 @@ from rafl.common.interruption import Terminated, interruptible
 P = ParamSpec("P")
 R = TypeVar("R")
 
+MAX_WAIT = 60.0  # [s], see `failure`; imports from a slow disk take some
+
 
 def report_errors(command: Callable[P, R]) -> Callable[P, R]:
     """Wrap a command so that it reports errors in one line on standard error instead of a traceback.
@@ -30,25 +34,47 @@ def report_errors(command: Callable[P, R]) -> Callable[P, R]:
             with interruptible():
                 return command(*args, **kwargs)
         except InputError as error:
-            raise _failure(f"error: {error}", 2) from None
+            raise failure(f"error: {error}", 2) from None
         except OSError as error:
             path = error.filename or "a file"
             reason = error.strerror or error
             message = f"error: {path}: {reason}; check the path, its permissions and the space on the disk"
-            raise _failure(message, 2) from None
+            raise failure(message, 2, shared=False) from None
         except MemoryError:
             message = "error: expected more free memory; end other programs, or use fewer recordings or a coarser mesh"
-            raise _failure(message, 2) from None
+            raise failure(message, 2, shared=False) from None
         except KeyboardInterrupt as error:
-            message = "interrupted; no incomplete file was left"
-            raise _failure(message, 143 if isinstance(error, Terminated) else 130) from None
+            if _is_first():
+                typer.echo("interrupted; no incomplete file was left", err=True)
+            raise typer.Exit(143 if isinstance(error, Terminated) else 130) from None
 
     return wrapped
 
 
-def _failure(message: str, code: int) -> typer.Exit:
+def failure(message: str, code: int, shared: bool = True) -> typer.Exit:
+    """Report an error in one line on standard error.
+
+    Of the processes that torchrun started on this machine, the first reports an error that all raise. The others wait
+    for torchrun to end them once the first has ended; if one of them ended sooner, torchrun would not let the first
+    report. Whoever waits in vain has an error of its own, and reports it.
+
+    Args:
+        message: to report.
+        code: for the exit.
+        shared: whether all processes may raise the error.
+
+    Returns:
+        The exit, to be raised.
+    """
+    if shared and not _is_first():
+        time.sleep(MAX_WAIT)
     typer.echo(one_line(message), err=True)
     return typer.Exit(code)
+
+
+def _is_first() -> bool:
+    """Whether this is the first of the processes that torchrun started on this machine, or the only one."""
+    return os.environ.get("LOCAL_RANK", "0") == "0"
 
 
 def one_line(text: str) -> str:
@@ -68,7 +94,7 @@ def create_app(help_text: str) -> typer.Typer:
     )
 
 
-def progress() -> Progress:
+def progress(shown: bool = True) -> Progress:
     """A progress bar on standard error, so that standard output holds results only."""
     return Progress(
         TextColumn("{task.description}", markup=False),
@@ -77,6 +103,7 @@ def progress() -> Progress:
         TimeRemainingColumn(),
         console=Console(stderr=True, markup=False),
         transient=True,
+        disable=not shown,
     )
 
 

@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 from rafl.common.errors import SimulationError
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
-from rafl.data.objective import Recordings, frame_errors
+from rafl.data.objective import Recordings
 from rafl.data.strain_range import StrainRange
+from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.gauss_newton import GOOD, Minimum
 from rafl.fitting.material_search import History, MaterialSearch
 from rafl.fitting.run_folder import FittedModel, Settings, save_model
 from rafl.fitting.sysid import BRANCHES, add_constitutive_residual, branches_search
-from rafl.fitting.train_field import Report, prepare_datasets, training_items
+from rafl.fitting.train_field import Report, prepare_datasets, recording_errors, training_items
 from rafl.simulation.rollout import rollout
 
 SELECTION_FILE = "selection.csv"
@@ -43,7 +44,9 @@ class Candidate:
     errors: NDArray[np.float64]
 
 
-def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
+def fit_auto(
+    datasets: list[Dataset], settings: Settings, run: Path, report: Report, group: ProcessGroup = ALONE
+) -> FittedModel:
     """Identify the material, fit a constitutive residual on top, and keep the simplest model that predicts as well.
 
     The candidates are the assumed material; E, nu and Maxwell branches; and these with a learned strain energy and
@@ -59,15 +62,18 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
         SimulationError: the assumed material itself cannot be simulated.
     """
     training_items(datasets)
-    history = History(run, report)
-    judge = _Judge(prepare_datasets(datasets, settings))
+    history = History(run, report, group)
+    judge = _Judge(prepare_datasets(datasets, settings), group)
     model = FittedModel(ASSUMED)
     candidates = [Candidate(ASSUMED, model, judge.assumed_errors(model))]
+    tables: dict[str, str] = {}
 
     def consider(name: str, search: MaterialSearch, minimum: Minimum) -> None:
         fitted = replace(search.model(minimum.x), method=name)
         candidates.append(Candidate(name, fitted, judge.errors(fitted, search, minimum)))
-        write_text(run / f"parameters-{name}.csv", search.parameter_table(minimum))
+        tables[name] = search.parameter_table(minimum)
+        if group.is_main:
+            write_text(run / f"parameters-{name}.csv", tables[name])
 
     branches, start = branches_search(datasets, settings, history, run / f"checkpoint-{BRANCHES}.pt", with_prior=True)
     minimum = branches.descend(start, settings.epochs, GOOD)
@@ -77,12 +83,12 @@ def fit_auto(datasets: list[Dataset], settings: Settings, run: Path, report: Rep
     consider("constitutive", learned, minimum)
 
     chosen = choose(candidates, judge.groups)
-    write_text(run / SELECTION_FILE, _table(candidates, chosen).to_csv(index=False, float_format="%.6g"))
     kept = replace(chosen.model, seen=judge.seen(chosen.model))
-    save_model(run, kept)
-    parameters = run / f"parameters-{chosen.name}.csv"
-    if parameters.exists():
-        write_text(run / "parameters.csv", parameters.read_text())
+    if group.is_main:
+        write_text(run / SELECTION_FILE, _table(candidates, chosen).to_csv(index=False, float_format="%.6g"))
+        save_model(run, kept)
+        if chosen.name in tables:
+            write_text(run / "parameters.csv", tables[chosen.name])
     return kept
 
 
@@ -161,7 +167,8 @@ def _judged(name: str, error: float) -> str:
 class _Judge:
     """What candidates are judged by: recordings left out of the training, and free runs."""
 
-    def __init__(self, datasets: list[Dataset]) -> None:
+    def __init__(self, datasets: list[Dataset], group: ProcessGroup) -> None:
+        self.group = group
         self.training = [Recordings.of(d, d.split("train")) for d in datasets if d.split("train")]
         self.validation = [Recordings.of(d, d.split("val")) for d in datasets if d.split("val")]
         counts = [len(recordings.names) for recordings in self.training]
@@ -187,13 +194,9 @@ class _Judge:
         return errors if self._stays_calm(model) else np.full(max(self.groups, 1), np.inf)
 
     def _simulated_errors(self, batches: list[Recordings], model: FittedModel) -> NDArray[np.float64]:
-        errors: list[float] = []
-        for recordings in batches:
-            simulator = model.simulator(recordings.dataset.simulator)
-            with torch.no_grad():
-                simulated, _ = recordings.in_simulator(simulator).simulate(parameters=model.parameters(simulator))
-            errors += [float(each.mean()) for each in frame_errors(recordings, simulated)]
-        return np.array(errors)
+        """Mean error of every recording [m], (R)."""
+        sums, frames = recording_errors(batches, model, self.group)
+        return sums / frames
 
     def _stays_calm(self, model: FittedModel) -> bool:
         """Whether a free run of the recording of the largest motion ends, and ends slower than it began."""
@@ -202,25 +205,32 @@ class _Judge:
         simulator = model.simulator(recordings.dataset.simulator)
         start = recordings.dataset.start([recordings.names[own]])
         steps = round(FREE_RUN / simulator.time_step)
-        try:
-            with torch.no_grad():
-                positions, _ = rollout(simulator, start, steps, parameters=model.parameters(simulator))
-        except SimulationError:
-            return False
-        speed = torch.diff(positions, dim=0).square().sum((1, 2, 3))
-        quarter = max(steps // 4, 1)
-        return bool(speed[-quarter:].mean() <= speed[:quarter].mean())
+
+        def compute() -> bool:
+            try:
+                with torch.no_grad():
+                    positions, _ = rollout(simulator, start, steps, parameters=model.parameters(simulator))
+            except SimulationError:
+                return False
+            speed = torch.diff(positions, dim=0).square().sum((1, 2, 3))
+            quarter = max(steps // 4, 1)
+            return bool(speed[-quarter:].mean() <= speed[:quarter].mean())
+
+        return self.group.on_main(compute)
 
     def seen(self, model: FittedModel) -> tuple[float, float]:
         """Strain and strain rate [1/s] that the training recordings reach, as the model simulates them."""
-        found = None
-        for recordings in self.training:
-            simulator = model.simulator(recordings.dataset.simulator)
-            with torch.no_grad():
-                positions, _ = recordings.in_simulator(simulator).simulate_vertices(
-                    parameters=model.parameters(simulator)
-                )
-            own = StrainRange.of(simulator.mesh, positions, simulator.time_step)
-            found = own if found is None else found.united(own)
-        assert found is not None
-        return found.strain, found.rate
+
+        def compute() -> list[float]:  # by one process, for the range is that of all recordings together
+            found = StrainRange(0.0, 0.0)
+            for recordings in self.training:
+                simulator = model.simulator(recordings.dataset.simulator)
+                with torch.no_grad():
+                    positions, _ = recordings.in_simulator(simulator).simulate_vertices(
+                        parameters=model.parameters(simulator)
+                    )
+                found = found.united(StrainRange.of(simulator.mesh, positions, simulator.time_step))
+            return [found.strain, found.rate]
+
+        strain, rate = self.group.on_main(compute)
+        return strain, rate

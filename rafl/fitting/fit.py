@@ -11,10 +11,10 @@ from rafl.common.files import new_folders, sha256
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.data.objective import Objective
-from rafl.fitting.distributed import process_count, rank
+from rafl.fitting.distributed import process_group
 from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs
 from rafl.fitting.run_folder import HISTORY_FILE, SETTINGS_FILE, FittedModel, Settings, read_settings, write_settings
-from rafl.fitting.train_field import Report, pretraining_unavailable
+from rafl.fitting.train_field import Report, pretraining_unavailable, training_items
 from rafl.fitting.warm_start import MAX_VERTICES
 
 
@@ -42,6 +42,8 @@ def fit(
     limit_energy: bool = True,
 ) -> FittedModel:
     """Fit a model to the `train` recordings of datasets and keep the one with the least `val` error.
+
+    The processes that torchrun started share the recordings. All return the model; process 0 writes and reports.
 
     Args:
         datasets: dataset files, or one.
@@ -71,45 +73,44 @@ def fit(
         limit_energy: whether the energy that a field adds to a motion is limited by what it added in training.
 
     Raises:
-        InputError: a file, the run folder or an option does not suit the method; or torchrun with a method that trains
-            in one process only.
+        InputError: a file, the run folder or an option does not suit the method.
         SimulationError: the simulator did not converge; the message names recording and step.
+        OtherProcessError: another process that torchrun started has ended.
     """
     paths = [Path(path) for path in ([datasets] if isinstance(datasets, str | Path) else datasets)]
-    loaded = [read_dataset(path) for path in paths]
-    settings = Settings(
-        method=method,
-        datasets=tuple(str(path.resolve()) for path in paths),
-        epochs=epochs or DEFAULT_EPOCHS.get(method, 1),
-        learning_rate=learning_rate,
-        weight_decay=weight_decay,
-        patience=patience,
-        frames=frames,
-        seed=seed,
-        batch=batch,
-        force_penalty=force_penalty,
-        warm_start=warm_start,
-        start=str(Path(start).resolve()) if start else "",
-        by_sigma=by_sigma,
-        objective=objective,
-        integrator=integrator,
-        limit_energy=limit_energy,
-        sha256=tuple(map(sha256, paths)),
-    )
-    check_inputs(method, loaded, Path(start) if start else None, integrator)
-    if process_count() > 1 and method != "rafl":
-        raise InputError(
-            f"torchrun: expected method rafl, the only one that trains on several processes, found {method}; run "
-            "rafl-fit without torchrun"
-        )
-    with ExitStack() as stack:
-        if rank() == 0:  # of the processes that torchrun started
-            stack.enter_context(open_run(Path(run), settings, resume))
-            _notify_unused_settings(loaded, settings, notify)
-        return METHODS[method](loaded, settings, Path(run), report or (lambda row: None))
+    with process_group() as group, ExitStack() as stack:
+        with group.fail_together():
+            loaded = [read_dataset(path) for path in paths]
+            settings = Settings(
+                method=method,
+                datasets=tuple(str(path.resolve()) for path in paths),
+                epochs=epochs or DEFAULT_EPOCHS.get(method, 1),
+                learning_rate=learning_rate,
+                weight_decay=weight_decay,
+                patience=patience,
+                frames=frames,
+                seed=seed,
+                batch=batch,
+                force_penalty=force_penalty,
+                warm_start=warm_start,
+                start=str(Path(start).resolve()) if start else "",
+                by_sigma=by_sigma,
+                objective=objective,
+                integrator=integrator,
+                limit_energy=limit_energy,
+                sha256=tuple(map(sha256, paths)),
+            )
+            check_inputs(method, loaded, Path(start) if start else None, integrator)
+            if group.is_main:
+                stack.enter_context(open_run(Path(run), settings, resume))
+                _notify_unused_settings(loaded, settings, notify, group.count)
+        used = report if report is not None and group.is_main else lambda row: None
+        return METHODS[method](loaded, settings, Path(run), used, group)
 
 
-def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify: Callable[[str], None]) -> None:
+def _notify_unused_settings(
+    datasets: list[Dataset], settings: Settings, notify: Callable[[str], None], processes: int
+) -> None:
     """Report pixels that are not compared, processes that get no recording, and pre-training that cannot be done."""
     with_pixels = [[item.has_pixels for item in dataset.trajectories.values()] for dataset in datasets]
     in_space = settings.objective == "3d"
@@ -121,8 +122,11 @@ def _notify_unused_settings(datasets: list[Dataset], settings: Settings, notify:
                 f"{dataset.name}: some recordings have no pixels; where they are compared together with others, "
                 "all are by their 3-D positions; build the dataset again from tracks"
             )
-    if process_count() > settings.batch:
-        notify(f"{process_count()} processes share a batch of {settings.batch}: raise --batch to use them all")
+    recordings = len(training_items(datasets))
+    if settings.method == "rafl" and processes > settings.batch:
+        notify(f"{processes} processes share a batch of {settings.batch}: raise --batch to use them all")
+    elif processes > recordings:
+        notify(f"{processes} processes share {recordings} training recordings: start fewer, for some have none")
     if settings.method == "rafl" and pretraining_unavailable(datasets, settings):
         notify(f"no pre-training: it needs implicit-euler, 1 substep, no viscosity and at most {MAX_VERTICES} vertices")
 

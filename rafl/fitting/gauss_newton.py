@@ -102,6 +102,9 @@ class Objective(Protocol):
     def curvature(self, x: Array) -> Array:
         """Gauss-Newton matrix of the mean loss at x, (n, n)."""
 
+    def agree(self, x: Array) -> Array:
+        """The variables to try next; where several processes search, those of one of them, in all."""
+
     def record(self, x: Array) -> None:
         """Called with the variables of every accepted step."""
 
@@ -135,7 +138,7 @@ def descend(
             break
         step *= length
         expected = -(gradient @ step + 0.5 * step @ model @ step)
-        end = np.clip(x + step, lows, highs)
+        end = objective.agree(np.clip(x + step, lows, highs))
         trial = objective.evaluate(end)
         gained = (found.loss - trial.loss * np.exp(prior.value(end) - prior.value(x))) / expected
         if gained > 0.0:

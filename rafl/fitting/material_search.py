@@ -13,6 +13,7 @@ from rafl.common.arrays import ArrayFormat, check_shape, check_values
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors, loss_curvature, recording_losses
+from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.gauss_newton import (
     EARLY,
     EXACT,
@@ -65,16 +66,25 @@ CURVATURE_RECORDINGS, CURVATURE_SIMULATIONS = 3, 24
 
 @dataclass
 class History:
-    """The rows of `history.csv` of a run, over all its searches."""
+    """The rows of `history.csv` of a run, over all its searches.
+
+    Attributes:
+        run: folder of the run.
+        report: called with every row.
+        group: processes that search together.
+        rows: so far.
+    """
 
     run: Path
     report: Report
+    group: ProcessGroup = ALONE
     rows: list[dict[str, float]] = field(default_factory=list)
 
     def append(self, row: dict[str, float]) -> None:
         """Append a row, write the file and report the row."""
         self.rows.append({"epoch": len(self.rows), **row})
-        write_history(self.run, self.rows)
+        if self.group.is_main:
+            write_history(self.run, self.rows)
         self.report(self.rows[-1])
 
 
@@ -85,7 +95,7 @@ class MaterialSearch:
         datasets: with the training recordings.
         settings: of the fit.
         quantities: to search for.
-        history: of the run.
+        history: of the run, with the processes that search together.
         checkpoint: file of earlier evaluations, which are not repeated.
         prior: of the variables; none by default.
     """
@@ -102,24 +112,39 @@ class MaterialSearch:
         used = prepare_datasets(datasets, settings)
         self.training = batches_by_dataset(training_items(used), settings)
         self.validation = validation_batches(used)
-        self.quantities, self.settings, self.history = quantities, settings, history
+        self.quantities, self.settings = quantities, settings
+        self.history, self.group = history, history.group
         # A frame that was found through the assumed material moves with it, which the recordings' loss does not show.
         self.intervals_known = not any(dataset.registered_through_model for dataset in used)
         self.prior = prior or Prior.flat(len(quantities))
         self.simulator = used[0].simulator
         self.frames = 0  # number of frames to simulate
-        self.evaluations: dict[tuple[float, ...], Evaluation] = {}  # by frames and variables
-        self.curvatures: dict[tuple[float, ...], Array] = {}
         self.checkpoint = checkpoint
-        if checkpoint.exists():
-            saved = load_tensors(checkpoint, "a checkpoint of this run")
-            with expect_content("a checkpoint of this version", checkpoint):
-                count, size = len(self.recording_names), len(quantities)
-                for key, losses, gradients in saved["known"]:
-                    values = _numbers(losses, (count,)).tolist(), _numbers(gradients, (count, size)).tolist()
-                    self.evaluations[tuple(_numbers(key, (1 + size,)).tolist())] = Evaluation(*values)
-                for key, value in saved["curvatures"]:
-                    self.curvatures[tuple(_numbers(key, (1 + size,)).tolist())] = _numbers(value, (size, size))
+        saved = self.group.on_main(self._read_checkpoint)
+        self.evaluations = {tuple(key): Evaluation(*values) for key, *values in saved["known"]}
+        self.curvatures = {tuple(key): np.array(value) for key, value in saved["curvatures"]}
+
+    def _read_checkpoint(self) -> dict[str, list[list[Any]]]:
+        """Evaluations (`known`) and Gauss-Newton matrices (`curvatures`), each after its frames and variables.
+
+        Both are empty if there is no checkpoint yet.
+
+        Raises:
+            InputError: the file is damaged, or holds other contents.
+        """
+        if not self.checkpoint.exists():
+            return {"known": [], "curvatures": []}
+        saved = load_tensors(self.checkpoint, "a checkpoint of this run")
+        count, size = len(self.recording_names), len(self.quantities)
+        shapes = {"known": [(1 + size,), (count,), (count, size)], "curvatures": [(1 + size,), (size, size)]}
+        with expect_content("a checkpoint of this version", self.checkpoint):
+            return {
+                name: [
+                    [_numbers(part, shape).tolist() for part, shape in zip(item, own, strict=True)]
+                    for item in saved[name]
+                ]
+                for name, own in shapes.items()
+            }
 
     @property
     def recording_names(self) -> list[str]:
@@ -195,23 +220,26 @@ class MaterialSearch:
         return (float(self.frames), *(float(value) for value in x))
 
     def _save(self) -> None:
+        """Write the checkpoint."""
+        if not self.group.is_main:
+            return
         known = [[list(key), *vars(value).values()] for key, value in self.evaluations.items()]
         curvatures = [[list(key), value.tolist()] for key, value in self.curvatures.items()]
         content: dict[str, object] = {"format": FORMAT, "method": self.settings.method}
         save_tensors(self.checkpoint, content | {"known": known, "curvatures": curvatures})
 
     def _simulate(self, x: Array) -> Evaluation:
-        losses: list[float] = []
-        gradients: list[list[float]] = []
-        for recordings in (each.first_frames(self.frames) for each in self.training):
-            variables = torch.tensor(x, dtype=torch.float64)[:, None].repeat(1, len(recordings.names)).requires_grad_()
+        def compute(recordings: Recordings, rows: list[int]) -> Array:
+            variables = torch.tensor(x, dtype=torch.float64)[:, None].repeat(1, len(rows)).requires_grad_()
             simulated, _ = recordings.simulate(parameters=self.parameters(variables, recordings))
-            own = recording_losses(recordings, simulated)
-            torch.autograd.backward(own.sum())
+            losses = recording_losses(recordings, simulated)
+            torch.autograd.backward(losses.sum())
             assert variables.grad is not None
-            losses += own.tolist()
-            gradients += variables.grad.T.tolist()
-        return Evaluation(losses, gradients)
+            return np.column_stack([losses.detach().numpy(), variables.grad.numpy().T])
+
+        cut = [recordings.first_frames(self.frames) for recordings in self.training]
+        table = self.group.by_recording(cut, 1 + len(x), compute)
+        return Evaluation(table[:, 0].tolist(), table[:, 1:].tolist())
 
     def curvature(self, x: Array) -> Array:
         """Gauss-Newton matrix of the recordings' mean loss at x, (n, n), by differences, from a few recordings."""
@@ -228,7 +256,8 @@ class MaterialSearch:
     def _gauss_newton_matrix(self, x: Array, recordings: Recordings, count: int) -> Array:
         """Mean Gauss-Newton matrix (n, n), from `count` recordings; all differences are simulated as one batch.
 
-        The others are taken to have the same matrix, in proportion to their mean squared motion.
+        The others are taken to have the same matrix, in proportion to their mean squared motion. Processes share the
+        simulations of the batch.
         """
         motion = recordings.square_motion
         chosen = _spread_by_size(motion, count)
@@ -236,12 +265,17 @@ class MaterialSearch:
         sets = x + DIFFERENCE_STEP * np.vstack([np.zeros(len(x)), np.eye(len(x))])
         batch = len(few.names)
         variables = torch.from_numpy(sets.T).repeat_interleave(batch, dim=1)  # every set with every recording
-        start = few.dataset.start(few.names * len(sets))
-        with torch.no_grad():
-            parameters = self.parameters(variables, few)
-            positions, _ = rollout(few.dataset.simulator, start, len(few.markers) - 1, parameters=parameters)
-            markers = few.dataset.markers.positions(positions)
-        markers = markers.reshape(len(markers), len(sets), batch, *markers.shape[2:])
+        frames, _, *of_markers = few.markers.shape
+        markers = torch.zeros(frames, len(sets) * batch, *of_markers, dtype=torch.float64)
+        columns = self.group.share(range(len(sets) * batch))
+        with self.group.fail_together(), torch.no_grad():
+            if columns:
+                start = few.dataset.start([few.names[k % batch] for k in columns])
+                parameters = self.parameters(variables[:, columns], few)
+                positions, _ = rollout(few.dataset.simulator, start, frames - 1, parameters=parameters)
+                markers[:, columns] = few.dataset.markers.positions(positions)
+        self.group.sum_over_processes([markers])
+        markers = markers.reshape(frames, len(sets), batch, *of_markers)
         slope = (markers[:, 1:] - markers[:, :1]) / DIFFERENCE_STEP
         own: Array = loss_curvature(few, markers[:, 0], slope).numpy()
         return own * float(motion.mean() / motion[chosen].mean()) if motion[chosen].mean() > 0.0 else own
@@ -252,6 +286,13 @@ class MaterialSearch:
             self.record(start)
         return descend(self, start, self.bounds, self.prior, evaluations, tolerance)
 
+    def agree(self, x: Array) -> Array:
+        """Variables as process 0 has computed them, in all processes."""
+        shared = torch.from_numpy(x.copy())
+        self.group.copy_from_main([shared])
+        found: Array = shared.numpy()
+        return found
+
     @property
     def bounds(self) -> tuple[Array, Array]:
         """Lower and upper bounds of the variables, (n) each."""
@@ -261,7 +302,7 @@ class MaterialSearch:
     def record(self, x: Array) -> None:
         """Append a row to the history; the errors are those of the frames that the search simulates."""
         validation = [recordings.first_frames(self.frames) for recordings in self.validation]
-        error = 1e3 * mean_error(validation, self.model(x))
+        error = 1e3 * mean_error(validation, self.model(x), self.group)
         shown = {q.name: float(q.value(x[k])) for k, q in enumerate(self.quantities) if not q.learned}
         if POISSON not in self.quantities:
             shown = {POISSON.name: FIXED_POISSONS_RATIO, **shown}
@@ -338,19 +379,19 @@ class MaterialSearch:
             slope = (len(group) * left_over - gradients[group].sum(0)) / count
             step = bounded_step(matrix, slope, lows - x, highs - x)
             variables[:, group] = np.clip(x + step, lows, highs)[:, None]
-        errors = np.concatenate(self._errors(variables))
+        errors = self._errors(variables)
         return [float(errors[group].mean()) for group in groups]
 
-    def _errors(self, variables: Array) -> list[Array]:
-        """Mean error [m] of the training recordings of every dataset, with variables by recording (n, R)."""
-        errors, first = [], 0
-        for recordings in self.training:
-            own = torch.from_numpy(np.ascontiguousarray(variables[:, first : first + len(recordings.names)]))
-            first += len(recordings.names)
+    def _errors(self, variables: Array) -> Array:
+        """Mean error of the training recordings [m], (R), with variables by recording (n, R)."""
+
+        def compute(recordings: Recordings, rows: list[int]) -> Array:
+            own = torch.from_numpy(np.ascontiguousarray(variables[:, rows]))
             with torch.no_grad():
                 simulated, _ = recordings.simulate(parameters=self.parameters(own, recordings))
-            errors.append(np.array([each.mean() for each in frame_errors(recordings, simulated)]))
-        return errors
+            return np.array([[each.mean()] for each in frame_errors(recordings, simulated)])
+
+        return self.group.by_recording(self.training, 1, compute)[:, 0]
 
 
 def _spread_by_size(sizes: Array, count: int) -> list[int]:

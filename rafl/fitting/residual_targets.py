@@ -17,6 +17,7 @@ from rafl.common.command_line import progress
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings
+from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.run_folder import FORMAT, expect_content, load_tensors, save_tensors
 from rafl.simulation.simulator import Simulator
 from rafl.simulation.time_integration import INTEGRATORS, State
@@ -91,31 +92,59 @@ def supports_residual_targets(simulator: Simulator) -> bool:
     return simulator.integrator == "implicit-euler" and simulator.substeps == 1 and not simulator.parameters().damped
 
 
-def training_targets(
-    dataset: Dataset, path: Path, max_markers: int | None = None, min_gain: float = MIN_RELATIVE_GAIN
-) -> tuple[Tensor, Tensor, Tensor]:
-    """States q, v at the start of the training recordings' steps, and their residual targets, all (S, N, 3).
+def compute_targets(
+    dataset: Dataset,
+    path: Path,
+    max_markers: int | None = None,
+    min_gain: float = MIN_RELATIVE_GAIN,
+    group: ProcessGroup = ALONE,
+) -> None:
+    """Write the residual targets of the training recordings to a file, unless it exists.
 
     Args:
         dataset: with training recordings.
-        path: file of the results; read if it exists, else written.
+        path: file of the results.
         max_markers: largest number of markers to follow, drawn with a fixed seed; None for all.
         min_gain: see `residual_targets`.
+        group: processes that share the recordings.
 
     Raises:
         SimulationError: the targets cannot be computed.
     """
-    if not path.exists():
-        recordings = Recordings.of(dataset, dataset.split("train"))
-        if max_markers is not None and len(dataset.markers.names) > max_markers:
-            chosen = np.random.default_rng(0).choice(len(dataset.markers.names), max_markers, replace=False)
-            recordings = recordings.select_markers(np.sort(chosen))
-        with progress() as bar:
-            task = bar.add_task(f"{dataset.name}: residual targets", total=len(recordings.markers) - 1)
-            targets = residual_targets(recordings, FORCE_PENALTY, lambda: bar.advance(task), min_gain)
-        observed = recordings.observed[1:].amax(-1).bool()
-        content = {key: torch.from_numpy(getattr(targets, key))[observed] for key in ("q", "v", "force")}
+    if group.on_main(path.exists):
+        return
+    recordings = Recordings.of(dataset, dataset.split("train"))
+    if max_markers is not None and len(dataset.markers.names) > max_markers:
+        chosen = np.random.default_rng(0).choice(len(dataset.markers.names), max_markers, replace=False)
+        recordings = recordings.select_markers(np.sort(chosen))
+    steps, own = len(recordings.markers) - 1, group.share(range(len(recordings.names)))
+    shape = (steps, len(recordings.names), len(dataset.simulator.mesh.vertices), 3)
+    gathered = {key: torch.zeros(shape, dtype=torch.float64) for key in ("q", "v", "force")}
+    with group.fail_together(), progress(group.is_main) as bar:
+        if own:
+            task = bar.add_task(f"{dataset.name}: residual targets", total=steps)
+            part = recordings.select(own)
+            targets = residual_targets(part, FORCE_PENALTY, lambda: bar.advance(task), min_gain)
+            for key, values in gathered.items():
+                values[:, own] = torch.from_numpy(getattr(targets, key))
+    observed = recordings.observed[1:].amax(-1).bool()
+    for values in gathered.values():
+        group.sum_over_processes([values])
+    if group.is_main:
+        content = {key: values[observed] for key, values in gathered.items()}
         save_tensors(path, {"format": FORMAT, "method": "residual forces", **content})
+
+
+def read_targets(dataset: Dataset, path: Path) -> tuple[Tensor, Tensor, Tensor]:
+    """States q, v at the start of the training recordings' steps, and their residual targets, all (S, N, 3).
+
+    Args:
+        dataset: as in `compute_targets`.
+        path: file that it wrote.
+
+    Raises:
+        InputError: the file is damaged, or holds other contents.
+    """
     saved = load_tensors(path, "residual targets of this run")
     with expect_content("residual targets of this run", path):
         count = len(saved["q"])
@@ -154,7 +183,10 @@ class _StepFit:
         return self.recordings.dataset.simulator
 
     def solve(self, force: Array) -> tuple[Array, Array, Array]:
-        """Positions after the step, the force, and the objective (B); starts from `force`, that of the last step."""
+        """Positions after the step, the force, and the objective (B); starts from `force`, that of the last step.
+
+        The iteration of each recording ends on its own, so that it does not depend on the others.
+        """
         x = self._simulate(force, None)
         gap, objective = self._gap_and_objective(x, force)
         jacobian = self._force_jacobian(x)
@@ -163,6 +195,7 @@ class _StepFit:
         transposed = jacobian.swapaxes(1, 2)
         normal = [cho_factor(a @ a.T + self.penalty * np.eye(len(a)), check_finite=False) for a in jacobian]
         free = self.simulator.engine.free_index
+        running = np.ones(len(force), dtype=bool)
         for _ in range(MAX_ITERATIONS):
             flat = force.reshape(len(force), -1)[:, free]
             right = (jacobian @ flat[..., None])[..., 0] - gap
@@ -172,12 +205,13 @@ class _StepFit:
             trial.reshape(len(force), -1)[:, free] = minimiser
             new_x = self._simulate(trial, x)
             new_gap, new_objective = self._gap_and_objective(new_x, trial)
-            better: Array = new_objective < objective
-            gain = float(((objective - new_objective) / np.maximum(objective, 1e-30))[better].max(initial=0.0))
+            better: Array = running & (new_objective < objective)
+            gain = np.where(better, (objective - new_objective) / np.maximum(objective, 1e-30), 0.0)
             keep = better[:, None, None]
             force, x = np.where(keep, trial, force), np.where(keep, new_x, x)
             gap[better], objective[better] = new_gap[better], new_objective[better]
-            if gain < self.min_gain:
+            running &= gain >= self.min_gain
+            if not running.any():
                 break
         return x, force, objective
 

@@ -8,6 +8,7 @@ import pandas as pd
 
 from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
+from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.gauss_newton import Array, Minimum, Prior
 from rafl.fitting.material_search import History, MaterialSearch
 from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, Quantity, material_values
@@ -21,7 +22,9 @@ BRANCHES = "sysid-branches"
 KEPT_DEVIATIONS = 0.05, 1.0
 
 
-def identify_material(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
+def identify_material(
+    datasets: list[Dataset], settings: Settings, run: Path, report: Report, group: ProcessGroup = ALONE
+) -> FittedModel:
     """Fit material parameters to the training recordings by least squares within bounds, from several starting points.
 
     Gradients are exact; the Gauss-Newton matrix is from differences of simulations that run as one batch.
@@ -35,7 +38,7 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
         InputError: no training recordings.
         SimulationError: the assumed material itself cannot be simulated.
     """
-    history, checkpoint = History(run, report), run / "checkpoint.pt"
+    history, checkpoint = History(run, report, group), run / "checkpoint.pt"
     if settings.method == BRANCHES:
         search, start = branches_search(datasets, settings, history, checkpoint)
         return _save(search, search.descend(start, settings.epochs), run)
@@ -43,7 +46,9 @@ def identify_material(datasets: list[Dataset], settings: Settings, run: Path, re
     return _save(search, search.solve(), run)
 
 
-def fit_constitutive(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
+def fit_constitutive(
+    datasets: list[Dataset], settings: Settings, run: Path, report: Report, group: ProcessGroup = ALONE
+) -> FittedModel:
     """Fit a learned strain energy and a learned viscosity together with the material, after the material alone.
 
     The files in the run are those of `identify_material`.
@@ -52,7 +57,7 @@ def fit_constitutive(datasets: list[Dataset], settings: Settings, run: Path, rep
         InputError: no training recordings.
         SimulationError: the assumed material itself cannot be simulated.
     """
-    history = History(run, report)
+    history = History(run, report, group)
     below, start = branches_search(datasets, settings, history, run / f"checkpoint-{BRANCHES}.pt")
     minimum = below.descend(start, settings.epochs)
     search = add_constitutive_residual(below, minimum, datasets, run / "checkpoint.pt")
@@ -113,9 +118,10 @@ def add_constitutive_residual(
 
 
 def _save(search: MaterialSearch, minimum: Minimum, run: Path) -> FittedModel:
-    model = search.model(minimum.x)
-    save_model(run, model)
-    write_text(run / "parameters.csv", search.parameter_table(minimum))
+    model, table = search.model(minimum.x), search.parameter_table(minimum)
+    if search.group.is_main:
+        save_model(run, model)
+        write_text(run / "parameters.csv", table)
     return model
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rafl.common.errors import InputError, SimulationError
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors, training_loss
-from rafl.fitting.distributed import ProcessGroup, process_group
+from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.run_folder import (
     FORMAT,
     FittedModel,
@@ -105,20 +105,33 @@ def validation_batches(datasets: list[Dataset]) -> list[Recordings]:
     return batches_by_dataset(chosen or training_items(datasets))
 
 
-def mean_error(batches: list[Recordings], model: FittedModel) -> float:
+def recording_errors(
+    batches: list[Recordings], model: FittedModel, group: ProcessGroup = ALONE
+) -> list[NDArray[np.float64]]:
+    """Sum over the frames of the mean marker error [m], and the number of frames, of some recordings, (R) each.
+
+    Raises:
+        SimulationError: a simulation fails.
+    """
+
+    def compute(recordings: Recordings, rows: list[int]) -> NDArray[np.float64]:
+        simulator = model.simulator(recordings.dataset.simulator)
+        with torch.no_grad():
+            simulated, _ = recordings.in_simulator(simulator).simulate(
+                model.residual(simulator), model.parameters(simulator)
+            )
+        return np.array([[each.sum(), len(each)] for each in frame_errors(recordings, simulated)])
+
+    return list(group.by_recording(batches, 2, compute).T)
+
+
+def mean_error(batches: list[Recordings], model: FittedModel, group: ProcessGroup = ALONE) -> float:
     """Mean marker error [m] over all frames of some recordings; infinite if a simulation fails."""
-    errors: list[NDArray[np.float64]] = []
-    with torch.no_grad():
-        for recordings in batches:
-            try:
-                simulator = model.simulator(recordings.dataset.simulator)
-                simulated, _ = recordings.in_simulator(simulator).simulate(
-                    model.residual(simulator), model.parameters(simulator)
-                )
-            except SimulationError:
-                return math.inf
-            errors += frame_errors(recordings, simulated)
-    return float(np.concatenate(errors).mean())
+    try:
+        sums, frames = recording_errors(batches, model, group)
+    except SimulationError:
+        return math.inf
+    return float(sums.sum() / frames.sum())
 
 
 def load_start_model(run: Path) -> FittedModel:
@@ -154,28 +167,30 @@ def pretraining_unavailable(datasets: list[Dataset], settings: Settings) -> bool
     return settings.warm_start > 0 and not any(can_fit_targets(dataset) for dataset in used)
 
 
-def fit_residual_field(datasets: list[Dataset], settings: Settings, run: Path, report: Report) -> FittedModel:
+def fit_residual_field(
+    datasets: list[Dataset], settings: Settings, run: Path, report: Report, group: ProcessGroup = ALONE
+) -> FittedModel:
     """Train a `ResidualField` by Adam, one update per batch of recordings, and keep the best on the validation set.
 
     If the field makes a simulation fail, the best field so far replaces it, the learning rate is halved, and training
     continues with the next batch.
 
     `checkpoint.pt`, `model.pt` and `history.csv` in `run` are written after every epoch. A second call with the same
-    settings resumes from the checkpoint and ends with the weights of an uninterrupted run. Under torchrun the
-    processes share every batch, and process 0 writes.
+    settings resumes from the checkpoint and ends with the weights of an uninterrupted run. Several processes share
+    every batch.
 
     Args:
         datasets: one or more specimens.
         settings: of the training.
         run: folder of the run.
         report: called with each epoch's history row.
+        group: processes that train together.
 
     Raises:
         InputError: no training recordings, or a checkpoint of another run.
         SimulationError: every rollout of an epoch failed; names recording and step.
     """
-    with process_group() as group:
-        return _Training(datasets, settings, run, report, group).train()
+    return _Training(datasets, settings, run, report, group).train()
 
 
 class _Training:
@@ -184,8 +199,7 @@ class _Training:
     def __init__(
         self, datasets: list[Dataset], settings: Settings, run: Path, report: Report, group: ProcessGroup
     ) -> None:
-        self.settings, self.run, self.group = settings, run, group
-        self.report: Report = report if group.is_main else lambda row: None
+        self.settings, self.run, self.group, self.report = settings, run, group, report
         start, full_length = _start_and_datasets(datasets, settings)
         datasets = [limit_frames(dataset, settings.frames) for dataset in full_length]
         self.items, self.validation = training_items(datasets), validation_batches(datasets)
@@ -195,7 +209,8 @@ class _Training:
         self.field = ResidualField() if start.field is None else start.field
         integration = datasets[0].simulator.time_integration
         self.model = FittedModel("rafl", self.field, start.material, time_integration=integration)
-        if not (run / CHECKPOINT_FILE).exists():
+        self.resumes = group.on_main((run / CHECKPOINT_FILE).exists)
+        if not self.resumes:
             if start.field is None:
                 self._initialise_field(datasets)
             pretrain(
@@ -207,6 +222,7 @@ class _Training:
                 self._validation_mm,
                 self.report,
                 trained=start.field is not None,
+                group=group,
             )
         self.optimiser = torch.optim.Adam(
             self.field.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
@@ -221,27 +237,29 @@ class _Training:
         training = [dataset for dataset in datasets if dataset.split("train")]
         mirrors = np.logical_and.reduce([dataset.simulator.symmetry_planes for dataset in training])
         self.field.impose_symmetry(torch.from_numpy(mirrors))
-        samples = torch.cat([_sample_features(dataset) for dataset in training])
-        self.field.set_scale(samples.square().mean(0).sqrt())
+        with self.group.fail_together():
+            if self.group.is_main:
+                samples = torch.cat([_sample_features(dataset) for dataset in training])
+                self.field.set_scale(samples.square().mean(0).sqrt())
+        self.group.copy_from_main(list(self.field.state_dict().values()))
 
     def _validation_mm(self) -> float:
         """The model's validation error [mm]."""
-        return 1e3 * mean_error(self.validation, self.model)
+        return 1e3 * mean_error(self.validation, self.model, self.group)
 
     def train(self) -> FittedModel:
         """Train until the last epoch or until the validation error has stalled."""
-        if (self.run / CHECKPOINT_FILE).exists():
+        if self.resumes:
             self._resume()
         else:
-            self.group.wait()  # until no process checks for the checkpoint any more
-            first = self.group.broadcast(self._validation_mm())
+            first = self._validation_mm()
             self.history.append({"epoch": 0, "loss": math.nan, "validation_mm": first, "learning_rate": 0.0})
             self._save(best=True)
         while self.history[-1]["epoch"] < self.settings.epochs and not self._has_stalled():
             loss, failed = self._run_epoch()
             rate = float(self.optimiser.param_groups[0]["lr"])
             self.schedule.step()
-            error = self.group.broadcast(self._validation_mm())
+            error = self._validation_mm()
             best = error < min(row["validation_mm"] for row in self.history)
             epoch = self.history[-1]["epoch"] + 1
             row = {"epoch": epoch, "loss": loss, "validation_mm": error, "learning_rate": rate}
@@ -258,8 +276,8 @@ class _Training:
 
     def _energy_fraction(self, model: FittedModel) -> float:
         """Limit of the field's work on other motions, from that on the training and validation recordings."""
-        largest = MIN_FRACTION
-        for recordings in [*batches_by_dataset(self.items), *self.validation]:
+
+        def compute(recordings: Recordings, rows: list[int]) -> NDArray[np.float64]:
             simulator = model.simulator(recordings.dataset.simulator)
             parameters, start = model.parameters(simulator), recordings.dataset.start(recordings.names)
             external = start.force + torch.from_numpy(simulator.weight)
@@ -270,9 +288,14 @@ class _Training:
                         *recordings.in_simulator(simulator).simulate_vertices(model.residual(simulator), parameters)
                     )
             except SimulationError:
-                continue
-            largest = max(largest, float((work / scale).max()))
-        return MARGIN * largest
+                return np.full((len(rows), 1), np.nan)
+            return (work / scale).numpy()[:, None]
+
+        batches = [*batches_by_dataset(self.items), *self.validation]
+        largest = self.group.by_recording(batches, 1, compute)
+        ends = np.cumsum([len(recordings.names) for recordings in batches])
+        finite = [float(each.max()) for each in np.split(largest, ends[:-1]) if not np.isnan(each).any()]
+        return MARGIN * max([MIN_FRACTION, *finite])
 
     def _has_stalled(self) -> bool:
         return has_stalled([row["validation_mm"] for row in self.history], self.settings.patience)

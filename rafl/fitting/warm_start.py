@@ -5,6 +5,7 @@ specimen at rest. That weights bending and the stiff deformations of cross-secti
 vertex exactly are worse targets: they are mostly noise and stiff modes, which a field fitted to them does not damp.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,8 @@ from torch import Tensor
 
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import Dataset
-from rafl.fitting.residual_targets import supports_residual_targets, training_targets
+from rafl.fitting.distributed import ALONE, ProcessGroup
+from rafl.fitting.residual_targets import compute_targets, read_targets, supports_residual_targets
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.features import FEATURES
 from rafl.residual.field_force import FieldPoints, layer_outputs
@@ -36,6 +38,10 @@ COLUMNS_PER_CHUNK = 512  # columns of the compliance matrix that are computed at
 class TargetFit:
     """The states and residual targets of one dataset, and the loss of a field on them, in single precision.
 
+    Args:
+        dataset: whose states they are.
+        targets: file that `compute_few_targets` has written.
+
     Attributes:
         states: number of states S.
         inputs: features at all quadrature points of a state, (34, S, P).
@@ -51,9 +57,8 @@ class TargetFit:
         simulator = dataset.simulator
         points = FieldPoints.of(simulator)
         count = 8 * len(points.hexes)
-        max_states = max(MAX_QUADRATURE_POINTS // count, BATCH_STATES)
-        limited = _limit_recordings(dataset, max_states)
-        q, v, force = (part.numpy() for part in training_targets(limited, targets, MAX_MARKERS, MIN_RELATIVE_GAIN))
+        max_states = _max_states(dataset)
+        q, v, force = (part.numpy() for part in read_targets(dataset, targets))
         if len(q) > max_states:
             drawn = np.sort(np.random.default_rng(0).choice(len(q), max_states, replace=False))
             q, v, force = q[drawn], v[drawn], force[drawn]
@@ -92,11 +97,21 @@ class TargetFit:
         return self._mean_work(force - self.force[chosen]) / self.work
 
 
-def _limit_recordings(dataset: Dataset, max_states: int) -> Dataset:
-    """As many evenly spaced training recordings as have about `max_states` states in total; at least one."""
+def _max_states(dataset: Dataset) -> int:
+    """Largest number of states whose features are kept; at least one batch."""
+    return max(MAX_QUADRATURE_POINTS // (8 * len(dataset.simulator.mesh.hexes)), BATCH_STATES)
+
+
+def compute_few_targets(dataset: Dataset, path: Path, group: ProcessGroup = ALONE) -> None:
+    """Write the targets of as many recordings as `TargetFit` can keep to a file; see `compute_targets`."""
+    compute_targets(_limit_recordings(dataset), path, MAX_MARKERS, MIN_RELATIVE_GAIN, group)
+
+
+def _limit_recordings(dataset: Dataset) -> Dataset:
+    """As many evenly spaced training recordings as have about `_max_states` states in total; at least one."""
     names = dataset.split("train")
     steps = max(len(dataset.trajectories[name].time) - 1 for name in names)
-    count = min(max(max_states // max(steps, 1), 1), len(names))
+    count = min(max(_max_states(dataset) // max(steps, 1), 1), len(names))
     kept = [names[k] for k in np.unique(np.linspace(0, len(names) - 1, count).round().astype(int))]
     return replace(dataset, trajectories={name: dataset.trajectories[name] for name in kept})
 
@@ -127,11 +142,15 @@ def pretrain(
     validate: Callable[[], float],
     report: Callable[[dict[str, float]], None],
     trained: bool = False,
+    group: ProcessGroup = ALONE,
 ) -> None:
     """Fit a field, in place, to the residual targets of the training recordings.
 
     Datasets that do not allow it are skipped. The best fit to the recorded states need not be stable near them, so
     the weights of the epoch with the lowest error in simulation are kept.
+
+    Several processes share the recordings, for the targets and for the errors in simulation. Process 0 alone updates
+    the weights: it alone needs memory for the states, and the result does not depend on the number of processes.
 
     Args:
         field: to be trained.
@@ -139,50 +158,80 @@ def pretrain(
         run: folder for the targets, `targets-<number>.pt`.
         epochs: passes over the states; 0 leaves the weights unchanged.
         seed: of the order of states.
-        validate: returns the field's error in simulation [mm].
+        validate: returns the field's error in simulation [mm]; called in all processes.
         report: called after each epoch with `warm_start` (its number), `missing` (the error in force as a fraction of
             the targets, root mean square in the norm of the loss) and `validation_mm`.
         trained: whether the field was trained before; a new field's scale is set from the states.
+        group: processes that train together.
 
     Raises:
         SimulationError: the targets cannot be computed.
     """
     if epochs == 0:
         return
+    usable = [(dataset, run / f"targets-{k}.pt") for k, dataset in enumerate(datasets) if can_fit_targets(dataset)]
+    if not usable:
+        return
+    updates = None
     try:
-        fits = [
-            TargetFit(dataset, run / f"targets-{number}.pt")
-            for number, dataset in enumerate(datasets)
-            if can_fit_targets(dataset)
-        ]
+        for dataset, path in usable:
+            compute_few_targets(dataset, path, group)
+        with group.fail_together():
+            if group.is_main:
+                updates = _Updates(field, [TargetFit(dataset, path) for dataset, path in usable], epochs, seed, trained)
     except SimulationError as error:
         raise SimulationError(f"{error}; train without pre-training: --warm-start 0") from None
-    if not fits:
-        return
-    if not trained:
-        with torch.no_grad():
-            field.set_scale(torch.from_numpy(np.sqrt(np.mean([fit.feature_rms**2 for fit in fits], axis=0))))
-    optimiser = torch.optim.AdamW(field.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
-    order = torch.Generator().manual_seed(seed)
-    updates = epochs * sum(max(fit.states // BATCH_STATES, 1) for fit in fits)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max(updates, 1), eta_min=0.01 * LEARNING_RATE)
-    errors, kept = [validate()], {key: value.clone() for key, value in field.state_dict().items()}
+
+    def validated() -> tuple[float, dict[str, Tensor]]:
+        group.copy_from_main(list(field.state_dict().values()))
+        return validate(), {key: value.clone() for key, value in field.state_dict().items()}
+
+    least, kept = validated()
     for epoch in range(epochs):
-        total = 0.0
-        batches = [(fit, chosen) for fit in fits for chosen in _state_batches(fit.states, order)]
-        for k in torch.randperm(len(batches), generator=order):
-            fit, chosen = batches[k]
-            optimiser.zero_grad()
-            loss = fit.loss(field, chosen)
-            torch.autograd.backward(loss)
-            optimiser.step()
-            schedule.step()
-            total += loss.item()
-        errors.append(validate())
-        report({"warm_start": epoch + 1, "missing": float(np.sqrt(total / len(batches))), "validation_mm": errors[-1]})
-        if errors[-1] < min(errors[:-1]):
-            kept = {key: value.clone() for key, value in field.state_dict().items()}
+        missing = math.nan if updates is None else updates.run_epoch()
+        reached, weights = validated()
+        report({"warm_start": epoch + 1, "missing": missing, "validation_mm": reached})
+        if reached < least:
+            least, kept = reached, weights
     field.load_state_dict(kept)
+
+
+class _Updates:
+    """The updates of a field's weights, by process 0.
+
+    Args:
+        field: to be trained.
+        fits: of the datasets.
+        epochs: number of passes.
+        seed: of the order of states.
+        trained: see `pretrain`.
+    """
+
+    def __init__(self, field: ResidualField, fits: list[TargetFit], epochs: int, seed: int, trained: bool) -> None:
+        self.field, self.fits = field, fits
+        if not trained:
+            with torch.no_grad():
+                field.set_scale(torch.from_numpy(np.sqrt(np.mean([fit.feature_rms**2 for fit in fits], axis=0))))
+        self.optimiser = torch.optim.AdamW(field.parameters(), lr=LEARNING_RATE, weight_decay=WEIGHT_DECAY)
+        self.order = torch.Generator().manual_seed(seed)
+        updates = epochs * sum(max(fit.states // BATCH_STATES, 1) for fit in fits)
+        self.schedule = torch.optim.lr_scheduler.CosineAnnealingLR(
+            self.optimiser, max(updates, 1), eta_min=0.01 * LEARNING_RATE
+        )
+
+    def run_epoch(self) -> float:
+        """Root mean squared loss of one pass over the states."""
+        total = 0.0
+        batches = [(fit, chosen) for fit in self.fits for chosen in _state_batches(fit.states, self.order)]
+        for k in torch.randperm(len(batches), generator=self.order):
+            fit, chosen = batches[k]
+            self.optimiser.zero_grad()
+            loss = fit.loss(self.field, chosen)
+            torch.autograd.backward(loss)
+            self.optimiser.step()
+            self.schedule.step()
+            total += loss.item()
+        return float(np.sqrt(total / len(batches)))
 
 
 def _state_batches(states: int, order: torch.Generator) -> tuple[Tensor, ...]:

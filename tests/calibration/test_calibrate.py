@@ -1,5 +1,7 @@
 """The command `rafl-calibrate` on rendered board images."""
 
+import functools
+import itertools
 import re
 from pathlib import Path
 
@@ -15,19 +17,24 @@ from rafl.calibration.rig import read_calibration
 SCALE = 9.0  # px/mm
 
 
-def board_image(tilt: np.ndarray, kind: str = "dots", supersampling: int = 4) -> np.ndarray:
+@functools.cache
+def board_image(tilt: tuple[float, float, float], kind: str = "dots", supersampling: int = 4) -> np.ndarray:
     """A tilted board: 9 x 6 dots of 5 mm, 10 mm apart, or a chessboard with as many inner corners."""
-    to_pixels = SCALE * Rotation.from_rotvec(tilt).as_matrix()[:2, :2]
-    size = (900, 640)
-    u, v = np.meshgrid(*(np.arange(n * supersampling) / supersampling - 0.5 + 0.5 / supersampling for n in size))
-    board = np.stack([u - 100.0, v - 90.0], axis=-1) @ np.linalg.inv(to_pixels).T
-    nearest = np.clip(np.rint(board / 10.0), 0, [8, 5]) * 10.0
-    dark = np.linalg.norm(board - nearest, axis=-1) < 2.5
-    if kind == "squares":
-        inside = ((board > -10) & (board < [90, 60])).all(axis=-1)
-        dark = inside & (np.floor(board / 10.0).astype(int).sum(axis=-1) % 2 == 0)
-    image = np.where(dark, 30.0, 210.0)
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+    to_board = np.linalg.inv(SCALE * Rotation.from_rotvec(tilt).as_matrix()[:2, :2])
+    u, v = np.arange(900)[None] - 100.0, np.arange(640)[:, None] - 90.0
+    dark = np.zeros((640, 900))
+    offsets = (np.arange(supersampling) + 0.5) / supersampling - 0.5
+    for du, dv in itertools.product(offsets, offsets):  # one array of all samples would not fit in the caches
+        x, y = (row[0] * (u + du) + row[1] * (v + dv) for row in to_board)
+        if kind == "squares":
+            inside = (x > -10) & (x < 90) & (y > -10) & (y < 60)
+            dark += inside & ((np.floor(x / 10.0) + np.floor(y / 10.0)) % 2 == 0)
+        else:
+            to_centre = (x - 10.0 * np.clip(np.rint(x / 10.0), 0, 8)) ** 2 + (
+                y - 10.0 * np.clip(np.rint(y / 10.0), 0, 5)
+            ) ** 2
+            dark += to_centre < 2.5**2
+    return np.asarray(210.0 - 180.0 * dark / supersampling**2).astype(np.uint8)
 
 
 TILTS = [[0, 0, 0], [0.4, 0, 0], [0, 0.45, 0], [0.3, 0.3, 0], [-0.3, 0.35, 0.05], [0.2, -0.4, 0], [-0.5, 0.1, 0]]
@@ -38,7 +45,7 @@ def dot_grid(tmp_path: Path) -> Path:
     folder = tmp_path / "grid"
     folder.mkdir()
     for number, tilt in enumerate(TILTS):
-        cv2.imwrite(str(folder / f"{number}.png"), board_image(np.array(tilt)))
+        cv2.imwrite(str(folder / f"{number}.png"), board_image(tuple(tilt)))
     (folder / "board.yaml").write_text(
         "format: rafl-board/1\npattern: {kind: dot-grid, dots: [9, 6], spacing_mm: 10}\n"
     )
@@ -73,7 +80,7 @@ def test_chessboard_calibration_is_checked_on_other_images(run: Run, tmp_path: P
     for folder, tilts in (("made", TILTS), ("held", [[0.25, 0.2, 0.03], [-0.2, 0.3, 0.0]])):
         (tmp_path / folder).mkdir()
         for number, tilt in enumerate(tilts):
-            cv2.imwrite(str(tmp_path / folder / f"{number}.png"), board_image(np.array(tilt), "squares"))
+            cv2.imwrite(str(tmp_path / folder / f"{number}.png"), board_image(tuple(tilt), "squares"))
         (tmp_path / folder / "board.yaml").write_text(
             "format: rafl-board/1\npattern: {kind: chessboard, corners: [9, 6], square_mm: 10}\n"
         )

@@ -11,7 +11,7 @@ from rafl.data.synthetic import loaded_equilibria, release_dataset, twisted_shap
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.fitting import residual_targets, warm_start
-from rafl.fitting.residual_targets import training_targets
+from rafl.fitting.residual_targets import compute_targets, read_targets
 from rafl.fitting.run_folder import FittedModel
 from rafl.fitting.train_field import mean_error
 from rafl.fitting.warm_start import pretrain
@@ -90,6 +90,7 @@ def test_number_of_states_is_limited(
 ) -> None:
     """Recordings of 19 steps are left out first, then steps, but at least one batch remains and can be fitted."""
     monkeypatch.setattr(warm_start, "MAX_QUADRATURE_POINTS", max_states * 8 * len(MESH.hexes))
+    warm_start.compute_few_targets(observed, tmp_path / "targets-0.pt")
     small = warm_start.TargetFit(observed, tmp_path / "targets-0.pt")
     assert small.states == states
     np.testing.assert_allclose(small.feature_rms, small.inputs.double().square().mean((1, 2)).sqrt().numpy(), rtol=1e-5)
@@ -104,6 +105,7 @@ def test_chunk_sizes_do_not_change_the_result(
 ) -> None:
     nodes = len(MESH.vertices)
     whole = BASE.solve_tangent(MESH.vertices[None], np.eye(3 * nodes).reshape(1, nodes, 3, -1))[0]
+    warm_start.compute_few_targets(observed, tmp_path / "targets-0.pt")
     once = warm_start.TargetFit(observed, tmp_path / "targets-0.pt")
     monkeypatch.setattr(warm_start, "STATES_PER_CHUNK", 7)
     monkeypatch.setattr(warm_start, "COLUMNS_PER_CHUNK", 10)
@@ -117,9 +119,12 @@ def test_chunk_sizes_do_not_change_the_result(
 def test_saved_targets_are_not_computed_again(
     observed: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    first = training_targets(observed, tmp_path / "targets-0.pt", 20)
+    path = tmp_path / "targets-0.pt"
+    compute_targets(observed, path, 20)
+    first = read_targets(observed, path)
     monkeypatch.setattr(residual_targets, "residual_targets", None)
-    for once, again in zip(first, training_targets(observed, tmp_path / "targets-0.pt", 20), strict=True):
+    compute_targets(observed, path, 20)
+    for once, again in zip(first, read_targets(observed, path), strict=True):
         assert torch.equal(once, again)
 
 
