@@ -23,9 +23,9 @@ class TensorBlockElimination:
     group and are eliminated together, padded to the size of the larger one: an added unknown has 1 on the diagonal and
     is coupled to none. So the loop over groups is half as long as that over levels, and nothing else is a loop.
 
-    The factors of a trajectory are one row of the storage. For each group, from the outermost inwards, it holds the
-    inverse L^-1 of the Cholesky factors, and the couplings C L^-T with the next group inward; last is L^-1 of the
-    middle. With inverses a solution takes products only, which suit a graphics card better than substitution.
+    The storage is a list of blocks of all trajectories: the inverses L^-1 of the Cholesky factors of every group, from
+    the outermost inwards, last of the middle; then the couplings C L^-T of every group with the next one inward. With
+    inverses a solution takes products only, which suit a graphics card better than substitution.
 
     Args:
         mesh: the rest shape.
@@ -54,7 +54,7 @@ class TensorBlockElimination:
         self._index_entries(mesh, found, groups)
 
     def _place_blocks(self) -> None:
-        """Slices of the blocks of every group in the storage."""
+        """Slices of the blocks of every group in an assembled row of numbers."""
         self._diagonals: list[slice] = []
         self._couplings: list[slice] = []
         end = 0
@@ -66,7 +66,7 @@ class TensorBlockElimination:
         self._size = self._diagonals[-1].stop
 
     def _index_unknowns(self, groups: list[list[int]], sizes: list[int]) -> None:
-        """Unknowns of every row of the groups, `count` for an added one, and where the diagonal is in the storage."""
+        """Unknowns of every row of the groups, `count` for an added one, and where the diagonal is in a row."""
         first = np.cumsum([0, *sizes[:-1]])
         unknowns, places = [], []
         for width, group, block in zip(self._widths, groups, self._diagonals, strict=True):
@@ -78,7 +78,7 @@ class TensorBlockElimination:
         self._diagonal_places = torch.from_numpy(np.concatenate(places)).to(self.device)
 
     def _index_entries(self, mesh: HexMesh, found: LevelSets, groups: list[list[int]]) -> None:
-        """Entries of the cell tangents (E * 576) that are needed, and their places in the storage."""
+        """Entries of the cell tangents (E * 576) that are needed, and their places in a row."""
         level_of_node = np.full(len(mesh.vertices), -1)
         row_of_node = np.zeros(len(mesh.vertices), dtype=np.int64)
         counts = np.array(found.sizes) // 3
@@ -119,66 +119,66 @@ class TensorBlockElimination:
 
     def allocate(self, batch: int) -> Factors:
         """Storage for the factors of a batch."""
-        storage = torch.zeros(batch, self._size, dtype=torch.float64, device=self.device)
-        return Factors(storage, np.zeros(batch, dtype=bool))
+        flat = torch.zeros(batch, self._size, dtype=torch.float64, device=self.device)
+        return Factors([block.contiguous() for block in self._blocks(flat)], np.zeros(batch, dtype=bool))
 
-    def _blocks(self, storage: Tensor) -> tuple[list[Tensor], list[Tensor]]:
-        """Views of the diagonal blocks and couplings of each group, (R, sides, rows, columns)."""
-        widths = self._widths
-        sides = [self._sides] * (len(widths) - 1) + [1]
-        diagonals = [
-            storage[:, block].view(-1, side, width, width)
-            for block, side, width in zip(self._diagonals, sides, widths, strict=True)
-        ]
-        couplings = [
-            storage[:, block].view(-1, self._sides, widths[k + 1], widths[k]) for k, block in enumerate(self._couplings)
-        ]
-        return diagonals, couplings
+    def _blocks(self, flat: Tensor) -> list[Tensor]:
+        """Views of the diagonal blocks, then of the couplings, of each group, (R, sides, rows, columns)."""
+        widths, sides = self._widths, [self._sides] * len(self._couplings) + [1]
+        diagonals = zip(self._diagonals, sides, widths, widths, strict=True)
+        couplings = zip(self._couplings, sides[:-1], widths[1:], widths[:-1], strict=True)
+        return [flat[:, block].view(-1, *shape) for block, *shape in (*diagonals, *couplings)]
 
-    def _assemble(self, storage: Tensor, tangents: Tensor, diagonal: Tensor) -> None:
-        """Fill the storage (R, size) with the lower blocks of tangents (R, E, 24, 24) plus a diagonal (R, n)."""
+    def _assembled(self, tangents: Tensor, diagonal: Tensor) -> Tensor:
+        """The lower blocks of tangents (R, E, 24, 24) plus a diagonal (R, n), (R, size)."""
         rows = len(tangents)
         values = tangents.reshape(rows, -1).index_select(1, self._entries)
-        storage.zero_().scatter_add_(1, self._places.expand(rows, -1), values)
+        flat = values.new_zeros(rows, self._size).scatter_add_(1, self._places.expand(rows, -1), values)
         added = torch.cat([diagonal, diagonal.new_ones(rows, 1)], dim=1)  # 1 for the added unknowns
-        storage[:, self._diagonal_places] += added.index_select(1, self._unknowns)
+        flat[:, self._diagonal_places] += added.index_select(1, self._unknowns)
+        return flat
 
     def factor(self, factors: Factors, rows: Array, tangents: Tensor, diagonal: Tensor) -> NDArray[np.bool_]:
-        """Factor `rows` (R) of the batch; True where the matrix is positive definite.
+        """Factor `rows` (R), in ascending order, of the batch; True where the matrix is positive definite.
 
         tangents: (R, E, 24, 24) [N/m]; diagonal: (R, n).
         """
-        whole = len(rows) == len(factors.ready)
-        storage = factors.storage if whole else factors.storage.new_empty(len(rows), self._size)
-        self._assemble(storage, tangents, diagonal)
-        diagonals, couplings = self._blocks(storage)
+        blocks = self._blocks(self._assembled(tangents, diagonal))
+        diagonals, couplings = blocks[: len(self._diagonals)], blocks[len(self._diagonals) :]
         infos = []
         for k, block in enumerate(diagonals):
             lower, info = torch.linalg.cholesky_ex(block)
             infos.append(info)
             identity = self._identity[: self._widths[k], : self._widths[k]]
-            block.copy_(torch.linalg.solve_triangular(lower, identity, upper=False))
+            inverse = torch.linalg.solve_triangular(lower, identity, upper=False)
+            block.copy_(inverse)
             if k < len(couplings):
-                coupling = couplings[k]
-                coupling.copy_(coupling @ block.mT)
+                coupling = couplings[k] @ inverse.mT
+                couplings[k].copy_(coupling)
                 square = coupling @ coupling.mT
                 diagonals[k + 1] -= square if k < len(couplings) - 1 else square.sum(1, keepdim=True)
         finite = diagonals[-1].diagonal(dim1=-2, dim2=-1).sum((1, 2)).isfinite()
-        definite = (finite & (torch.cat(infos, dim=1) == 0).all(1)).cpu().numpy()
-        if not whole:
-            factors.storage[torch.from_numpy(rows).to(self.device)] = storage
+        definite: NDArray[np.bool_] = (finite & (torch.cat(infos, dim=1) == 0).all(1)).cpu().numpy()
+        if len(rows) == len(factors.ready):
+            factors.storage = [block.contiguous() for block in blocks]
+        else:
+            index = torch.from_numpy(rows).to(self.device)
+            for own, block in zip(factors.storage, blocks, strict=True):
+                own[index] = block
         factors.ready[rows] = definite
         return definite
 
     def solve(self, factors: Factors, rows: Array, right: Tensor) -> Tensor:
         """Solutions (R, C, n) for right-hand sides (R, C, n)."""
-        whole = len(rows) == len(factors.ready)
-        storage = factors.storage if whole else factors.storage[torch.from_numpy(rows).to(self.device)]
-        diagonals, couplings = self._blocks(storage)
-        shape = len(rows), right.shape[1]
-        padded = torch.cat([right, right.new_zeros(*shape, 1)], dim=2).mT.index_select(1, self._unknowns)
+        blocks: list[Tensor] = factors.storage
+        if len(rows) != len(factors.ready):
+            index = torch.from_numpy(rows).to(self.device)
+            blocks = [block[index] for block in blocks]
+        diagonals, couplings = blocks[: len(self._diagonals)], blocks[len(self._diagonals) :]
+        batch, columns, _ = right.shape
+        padded = torch.cat([right, right.new_zeros(batch, columns, 1)], dim=2).mT.index_select(1, self._unknowns)
         parts = torch.split(padded, [block.shape[1] * block.shape[2] for block in diagonals], dim=1)
-        x = [part.view(*block.shape[:3], -1) for part, block in zip(parts, diagonals, strict=True)]
+        x = [part.reshape(*block.shape[:3], columns) for part, block in zip(parts, diagonals, strict=True)]
         last = len(couplings) - 1
         for k, coupling in enumerate(couplings):
             x[k] = diagonals[k] @ x[k]
@@ -187,9 +187,8 @@ class TensorBlockElimination:
         x[-1] = diagonals[-1].mT @ (diagonals[-1] @ x[-1])
         for k in reversed(range(len(couplings))):
             x[k] = diagonals[k].mT @ (x[k] - couplings[k].mT @ x[k + 1])
-        flat = torch.cat([part.flatten(1, 2) for part in x], dim=1)
-        out = right.new_empty(len(rows), self.count + 1, right.shape[1])
-        out[:, self._unknowns] = flat
+        out = right.new_empty(batch, self.count + 1, columns)
+        out[:, self._unknowns] = torch.cat([part.flatten(1, 2) for part in x], dim=1)
         return out[:, :-1].mT
 
     def solve_indefinite(self, tangents: Tensor, diagonal: Tensor, right: Tensor) -> Tensor:

@@ -30,7 +30,10 @@ def signed_svd(F: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     found = (s1 > MIN_RELATIVE_STRETCH * s0) & (along.abs() < MAX_COSINE * s1)
     u1 = torch.where(found, u1, _any_normal(u0))
     u2 = torch.linalg.cross(u0, u1, dim=0)
-    U, V = (torch.stack(parts, dim=1).reshape(9, -1).T.reshape(F.shape) for parts in ((u0, u1, u2), (v0, v1, third)))
+    U, V = (
+        torch.stack(parts, dim=1).reshape(9, -1).T.contiguous().reshape(F.shape)
+        for parts in ((u0, u1, u2), (v0, v1, third))
+    )
     return U, torch.stack([s0, s1, (u2 * b2).sum(0)], dim=-1).reshape(F.shape[:-1]), V
 
 
