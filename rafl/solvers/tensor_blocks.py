@@ -15,6 +15,8 @@ from rafl.solvers.linear import Factors
 
 Array = NDArray[Any]
 
+MAX_DIRECT_SIZE = 128  # of a matrix that the library factors; batches of larger ones it factors slowly on a card
+
 
 class TensorBlockElimination:
     """Cholesky factors of a block-tridiagonal matrix, by block elimination from both ends to the middle.
@@ -48,7 +50,6 @@ class TensorBlockElimination:
         sizes = [*found.sizes, 0]  # of no level
         self._widths = [max(sizes[level] for level in group) for group in groups]
         self._sides = len(sides)
-        self._identity = torch.eye(max(self._widths), dtype=torch.float64, device=device)
         self._place_blocks()
         self._index_unknowns(groups, sizes)
         self._index_entries(mesh, found, groups)
@@ -147,10 +148,8 @@ class TensorBlockElimination:
         diagonals, couplings = blocks[: len(self._diagonals)], blocks[len(self._diagonals) :]
         infos = []
         for k, block in enumerate(diagonals):
-            lower, info = torch.linalg.cholesky_ex(block)
+            inverse, info = inverse_factors(block)
             infos.append(info)
-            identity = self._identity[: self._widths[k], : self._widths[k]]
-            inverse = torch.linalg.solve_triangular(lower, identity, upper=False)
             block.copy_(inverse)
             if k < len(couplings):
                 coupling = couplings[k] @ inverse.mT
@@ -204,3 +203,25 @@ class TensorBlockElimination:
         matrix = coo_array((values, (row[free], column[free])), shape=(self.count, self.count))
         factor = splu((matrix + diags_array(diagonal.cpu().numpy())).tocsc())
         return torch.from_numpy(factor.solve(right.cpu().numpy().T).T).to(right)
+
+
+def inverse_factors(matrix: Tensor) -> tuple[Tensor, Tensor]:
+    """Inverses of the Cholesky factors of matrices (..., m, m), and (...) numbers, 0 where one is positive definite.
+
+    Only the lower triangles are read. Large matrices are halved, so that nearly all the work is in products:
+
+        A = [A1, B^T; B, A2],  L = [L1, 0; C, L2],  C = B L1^-T,  L2 L2^T = A2 - C C^T,  (L^-1)_21 = -L2^-1 C L1^-1.
+    """
+    size = matrix.shape[-1]
+    if size <= MAX_DIRECT_SIZE:
+        lower, info = torch.linalg.cholesky_ex(matrix)
+        identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
+        return torch.linalg.solve_triangular(lower, identity, upper=False), info
+    half = size // 2
+    first, info = inverse_factors(matrix[..., :half, :half])
+    below = matrix[..., half:, :half] @ first.mT
+    second, other = inverse_factors(matrix[..., half:, half:] - below @ below.mT)
+    whole = torch.zeros_like(matrix, memory_format=torch.contiguous_format)
+    whole[..., :half, :half], whole[..., half:, half:] = first, second
+    whole[..., half:, :half] = -second @ (below @ first)
+    return whole, info.maximum(other)

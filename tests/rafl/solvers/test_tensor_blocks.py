@@ -6,7 +6,7 @@ from devices import ON_DEVICES
 from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.torch_engine import TorchEngine
-from rafl.solvers.tensor_blocks import TensorBlockElimination
+from rafl.solvers.tensor_blocks import MAX_DIRECT_SIZE, TensorBlockElimination, inverse_factors
 
 CELLS = np.ones((6, 3, 2), dtype=bool)
 CELLS[2:4, 0] = False  # a waist, so that level sets differ in size
@@ -89,3 +89,20 @@ def test_levels_are_eliminated_from_both_ends() -> None:
     assert solver.count == 7 * 27
     blocks = solver.allocate(1).storage
     assert [tuple(block.shape) for block in blocks] == [*[(1, 2, 27, 27)] * 3, (1, 1, 27, 27), *[(1, 2, 27, 27)] * 3]
+
+
+@ON_DEVICES
+@pytest.mark.parametrize("size", [1, MAX_DIRECT_SIZE, MAX_DIRECT_SIZE + 1, 3 * MAX_DIRECT_SIZE + 7])
+def test_inverse_factors(size: int, device: str, random: np.random.Generator) -> None:
+    """Of a batch with an indefinite matrix in either half, from the lower triangles only."""
+    root = torch.tensor(random.normal(size=(2, 3, size, size)), device=device)
+    matrix = root @ root.mT + size * torch.eye(size, dtype=root.dtype, device=device)
+    lower = torch.linalg.cholesky(matrix)
+    read = matrix.tril()
+    read[0, 1, 0, 0] = read[1, 2, -1, -1] = -1.0
+    inverse, info = inverse_factors(read)
+    definite = torch.tensor([[True, False, True], [True, True, False]], device=device)
+    assert bool(((info == 0) == definite).all())
+    identity = torch.eye(size, dtype=root.dtype, device=device)
+    assert float((inverse[definite] @ lower[definite] - identity).abs().max()) < 1e-12
+    assert float(inverse[definite].triu(1).abs().max()) == 0.0
