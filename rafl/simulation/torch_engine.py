@@ -59,6 +59,8 @@ class TorchEngine:
             else PointElements(self.quadrature, law, self.device)
         )
         self._hexes = torch.from_numpy(mesh.hexes).to(self.device)
+        self._unknowns = (3 * self._hexes[..., None] + torch.arange(3, device=self.device)).reshape(-1)
+        self._fixed = torch.from_numpy(fixed).to(self.device)
         self._cells_at_fixed = torch.from_numpy(np.flatnonzero(np.isin(mesh.hexes, fixed).any(axis=1))).to(self.device)
 
     @cached_property
@@ -101,8 +103,7 @@ class TorchEngine:
     def _scatter(self, forces: Tensor) -> Tensor:
         """Sum of the forces of the cells (B, E, 8, 3) at every node, (B, N, 3)."""
         out = forces.new_zeros(len(forces), len(self.mesh.vertices) * 3)
-        index = (3 * self._hexes[..., None] + torch.arange(3, device=self.device)).reshape(-1)
-        out.scatter_add_(1, index.expand(len(forces), -1), forces.flatten(1))
+        out.scatter_add_(1, self._unknowns.expand(len(forces), -1), forces.flatten(1))
         return out.reshape(len(forces), -1, 3)
 
     def evaluate(
@@ -168,7 +169,7 @@ class TorchEngine:
         at_cells = self._tensor(x)[:, self._hexes[cells]].reshape(len(x), -1, 24, 1)
         forces = self._tensor(x).new_zeros(len(x), len(self.mesh.hexes), 8, 3)
         forces[:, cells] = (tangents[:, cells] @ at_cells).reshape(len(x), -1, 8, 3)
-        out: Array = self._scatter(forces)[:, torch.from_numpy(self.fixed).to(self.device)].cpu().numpy()
+        out: Array = self._scatter(forces)[:, self._fixed].cpu().numpy()
         return out
 
     def thread_limit(self, batch: int) -> AbstractContextManager[None]:

@@ -4,11 +4,13 @@
 
 Without --device the tensors run on a graphics card if torch finds one, else on the processor. The beam is of preset
 physical under generalised-alpha, one step per frame; each trajectory starts with another velocity. Every case is a
-process of its own, which is ended after --limit seconds with what it has measured by then.
+process of its own, which is ended after --limit seconds with what it has measured by then. The kernels take all
+processors; tensors on a processor take one thread, as in the commands.
 """
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 import time
@@ -91,9 +93,11 @@ class Case:
 
     def run(self, limit: float) -> dict[str, object]:
         """What a process of its own has measured, with `error` if it failed; empty if it was ended before any step."""
+        own = {"OMP_NUM_THREADS": "1"} if self.arithmetic == "torch" else {}
         line = [sys.executable, __file__, "--case", self.refinement, self.batch, self.arithmetic, self.device]
         try:
-            done = subprocess.run([str(word) for word in line], capture_output=True, timeout=limit, check=False)
+            words, environment = [str(word) for word in line], {**os.environ, **own}
+            done = subprocess.run(words, capture_output=True, timeout=limit, check=False, env=environment)
             out, error = done.stdout, done.stderr if done.returncode else b""
         except subprocess.TimeoutExpired as stopped:
             out, error = stopped.stdout or b"", b""

@@ -15,8 +15,9 @@ from rafl.fem.constitutive_state import ConstitutiveState
 from rafl.fem.enhanced.hourglass import MODES, HourglassModes
 from rafl.fem.quadrature import QuadratureRule
 from rafl.fem.strain import MULTIPLICITY
+from rafl.fem.tensors.constants import numbers
 from rafl.fem.tensors.hourglass import HourglassFrame, modes_energy
-from rafl.fem.tensors.stress import COMPONENTS, Point, Terms, damping, elastic, symmetric, viscous
+from rafl.fem.tensors.stress import Point, Terms, components, damping, elastic, symmetric, viscous
 
 
 @dataclass(frozen=True)
@@ -127,12 +128,14 @@ class PointElements:
         strain = 0.5 * (F.mT @ F - torch.eye(3, dtype=F.dtype, device=F.device))
         product = F.mT @ change
         both = strain, 0.5 * (product + product.mT)
-        first, second = (tensor.flatten(-2)[..., COMPONENTS].flatten(2) for tensor in both)
+        first, second = (components(tensor).flatten(2) for tensor in both)
         return first, second
 
     def strains_adjoint(self, x: Tensor, by_strain: Tensor, cells: slice) -> Tensor:
         """Derivative of the weighted sum of the strains."""
-        weights = by_strain.reshape(*by_strain.shape[:-1], self.points, 6) / by_strain.new_tensor(MULTIPLICITY)
+        weights = by_strain.reshape(*by_strain.shape[:-1], self.points, 6) / numbers(
+            tuple(MULTIPLICITY), by_strain.device
+        )
         return self.nodal(self.gradients(x, cells) @ symmetric(weights), cells)
 
 

@@ -12,17 +12,21 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from rafl.fem.tensors.constants import numbers
 from rafl.fem.tensors.stress import Point
 
 MIN_ROTATION_STIFFNESS = 1e-8  # of G, relative to no stretch: bounds the rotation of a flattened cell
-# Matrices of the cross products with the three axes, (3, 3, 3), flat.
-CROSS = (0, 0, 0, 0, 0, -1, 0, 1, 0, 0, 0, 1, 0, 0, 0, -1, 0, 0, 0, -1, 0, 1, 0, 0, 0, 0, 0)
+CROSS = (0.0, 0, 0, 0, 0, -1, 0, 1, 0, 0, 0, 1, 0, 0, 0, -1, 0, 0, 0, -1, 0, 1, 0, 0, 0, 0, 0)
+
+
+def _axes(like: Tensor) -> Tensor:
+    """Matrices of the cross products with the three axes, (3, 3, 3)."""
+    return numbers(CROSS, like.device).reshape(3, 3, 3)
 
 
 def _cross(v: Tensor) -> Tensor:
     """Matrices of the cross products with v (..., 3), (..., 3, 3)."""
-    axes = v.new_tensor(CROSS).reshape(3, 9)
-    return (v @ axes).reshape(*v.shape, 3)
+    return (v @ _axes(v).reshape(3, 9)).reshape(*v.shape, 3)
 
 
 @dataclass(frozen=True)
@@ -54,7 +58,7 @@ class HourglassFrame:
         least = torch.full_like(pairs, MIN_ROTATION_STIFFNESS).copysign(pairs)
         pairs = torch.where(pairs.abs() > MIN_ROTATION_STIFFNESS, pairs, least)
         inverse = (V / pairs[..., None, :]) @ V.mT
-        axes = inverse.new_tensor(CROSS).reshape(3, 3, 3).transpose(0, 1).reshape(3, 9)
+        axes = _axes(inverse).transpose(0, 1).reshape(3, 9)
         local = vectors @ rotation
         sweep = _cross(local).flatten(-3, -2)
         return cls(rotation, (V * s[..., None, :]) @ V.mT, inverse, inverse @ axes, local.flatten(-2), sweep)
@@ -96,8 +100,7 @@ class HourglassFrame:
             corner = corner + trace - columns
         corner = self.turn.mT @ corner
         if not project:
-            axes = force.new_tensor(CROSS).reshape(3, 3, 3)
-            turned = (axes @ moment[..., None, :, None])[..., 0]  # e_j x n, (B, E, 3, 3)
+            turned = (_axes(force) @ moment[..., None, :, None])[..., 0]  # e_j x n, (B, E, 3, 3)
             corner = corner - (_cross(turned) @ self.turn[..., None, :, :]).flatten(-3, -2)
         across = driven @ self.turn
         whole = torch.cat([torch.cat([corner, across.mT], -1), torch.cat([across, stiffness], -1)], -2)

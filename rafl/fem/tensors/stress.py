@@ -12,6 +12,7 @@ from torch import Tensor
 from rafl.fem.constitutive_state import DAMPING, ConstitutiveState
 from rafl.fem.laws import LAWS
 from rafl.fem.learned_energy import reference_learned_energy
+from rafl.fem.tensors.constants import indices
 from rafl.fem.tensors.svd import signed_svd
 
 STRETCH_PAIRS = ((0, 1), (1, 2), (2, 0))  # order of the pair stiffnesses of `rafl.fem.laws`
@@ -55,9 +56,15 @@ class Terms:
         return Terms(self.energy + other.energy, self.stress + other.stress, tangent)
 
 
-def symmetric(components: Tensor) -> Tensor:
+def symmetric(values: Tensor) -> Tensor:
     """Tensors (..., 3, 3) from their components 00 11 22 01 12 02 (..., 6)."""
-    return components[..., EXPANSION].reshape(*components.shape[:-1], 3, 3)
+    expanded = values.index_select(-1, indices(EXPANSION, values.device))
+    return expanded.reshape(*values.shape[:-1], 3, 3)
+
+
+def components(tensor: Tensor) -> Tensor:
+    """Components 00 11 22 01 12 02 (..., 6) of symmetric tensors (..., 3, 3)."""
+    return tensor.flatten(-2).index_select(-1, indices(COMPONENTS, tensor.device))
 
 
 def elastic(law: str, point: Point, shares: Tensor, state: ConstitutiveState, tangent: bool, project: bool) -> Terms:
@@ -76,7 +83,7 @@ def elastic(law: str, point: Point, shares: Tensor, state: ConstitutiveState, ta
     return Terms(energy, stress, _tangent(point, first, second, flip, project) if tangent else None)
 
 
-def _local_entries() -> list[int]:
+def _local_entries() -> tuple[int, ...]:
     """For every entry of the tangent in the frame of the singular vectors, (81), where `_tangent` finds its value."""
     entries = [15] * 81  # zero
     for a in range(3):
@@ -86,7 +93,7 @@ def _local_entries() -> list[int]:
         one, other = 3 * a + b, 3 * b + a
         entries[9 * one + one] = entries[9 * other + other] = 9 + k
         entries[9 * one + other] = entries[9 * other + one] = 12 + k
-    return entries
+    return tuple(entries)
 
 
 LOCAL_ENTRIES = _local_entries()
@@ -103,8 +110,7 @@ def _tangent(point: Point, first: Tensor, second: Tensor, flip: Tensor, project:
     if project:
         twist, flip = twist.clamp_min(0.0), flip.clamp_min(0.0)
     values = torch.cat([second.flatten(-2), 0.5 * (flip + twist), 0.5 * (flip - twist), torch.zeros_like(flip)], dim=-1)
-    index = torch.tensor(LOCAL_ENTRIES, device=values.device)
-    local = values.index_select(-1, index).reshape(*values.shape[:-1], 9, 9)
+    local = values.index_select(-1, indices(LOCAL_ENTRIES, values.device)).reshape(*values.shape[:-1], 9, 9)
     frame = (point.U[..., :, None, :, None] * point.V[..., None, :, None, :]).flatten(-2).flatten(-3, -2)
     return frame @ local @ frame.mT
 
