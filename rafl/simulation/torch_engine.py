@@ -79,7 +79,8 @@ class TorchEngine:
         return self.linear_solver.factorisation_cost
 
     def _tensor(self, array: Array | Tensor) -> Tensor:
-        return torch.as_tensor(array, dtype=torch.float64).to(self.device)
+        own = array if isinstance(array, Tensor) else torch.from_numpy(np.ascontiguousarray(array, dtype=np.float64))
+        return own.to(self.device)
 
     def place(self, state: ConstitutiveState) -> ConstitutiveState:
         """The state in tensors on the device."""

@@ -119,9 +119,8 @@ class TensorBlockElimination:
         self._cell_unknowns = (unknown_of_node[mesh.hexes][..., None] + components).reshape(-1, 24)  # negative: fixed
 
     def allocate(self, batch: int) -> Factors:
-        """Storage for the factors of a batch."""
-        flat = torch.zeros(batch, self._size, dtype=torch.float64, device=self.device)
-        return Factors([block.contiguous() for block in self._blocks(flat)], np.zeros(batch, dtype=bool))
+        """Storage for the factors of a batch, empty until the first are there."""
+        return Factors([], np.zeros(batch, dtype=bool))
 
     def _blocks(self, flat: Tensor) -> list[Tensor]:
         """Views of the diagonal blocks, then of the couplings, of each group, (R, sides, rows, columns)."""
@@ -144,6 +143,9 @@ class TensorBlockElimination:
 
         tangents: (R, E, 24, 24) [N/m]; diagonal: (R, n).
         """
+        whole, batch = len(rows) == len(factors.ready), len(factors.ready)
+        if whole:
+            factors.storage = []  # of a large mesh there is no room for two
         blocks = self._blocks(self._assembled(tangents, diagonal))
         diagonals, couplings = blocks[: len(self._diagonals)], blocks[len(self._diagonals) :]
         infos = []
@@ -158,9 +160,10 @@ class TensorBlockElimination:
                 diagonals[k + 1] -= square if k < len(couplings) - 1 else square.sum(1, keepdim=True)
         finite = diagonals[-1].diagonal(dim1=-2, dim2=-1).sum((1, 2)).isfinite()
         definite: NDArray[np.bool_] = (finite & (torch.cat(infos, dim=1) == 0).all(1)).cpu().numpy()
-        if len(rows) == len(factors.ready):
+        if whole:
             factors.storage = [block.contiguous() for block in blocks]
         else:
+            factors.storage = factors.storage or [block.new_zeros(batch, *block.shape[1:]) for block in blocks]
             index = torch.from_numpy(rows).to(self.device)
             for own, block in zip(factors.storage, blocks, strict=True):
                 own[index] = block

@@ -87,7 +87,13 @@ def test_levels_are_eliminated_from_both_ends() -> None:
     mesh = HexMesh.box((7, 2, 2), (0.07, 0.02, 0.02))
     solver = TensorBlockElimination(mesh, mesh.face_nodes("x-min"), torch.device("cpu"))
     assert solver.count == 7 * 27
-    blocks = solver.allocate(1).storage
+    factors = solver.allocate(2)
+    tangents, diagonal = (
+        torch.zeros(1, 28, 24, 24, dtype=torch.float64),
+        torch.ones(1, solver.count, dtype=torch.float64),
+    )
+    assert solver.factor(factors, np.array([1]), tangents, diagonal).all()
+    blocks = [block[1:] for block in factors.storage]
     assert [tuple(block.shape) for block in blocks] == [*[(1, 2, 27, 27)] * 3, (1, 1, 27, 27), *[(1, 2, 27, 27)] * 3]
 
 
