@@ -9,7 +9,7 @@ export OPENBLAS_NUM_THREADS := 1
 
 .PHONY: install demo test test-slow fuzz lint docs gallery wheel check-wheel real real-beam real-presets check-reference \
 	bench-simulator bench-tracking bench-paper bench-capture bench-places bench-sim2real bench-labs bench-laws bench-mesh \
-	bench-image bench-cluster laws clean
+	bench-image bench-cluster bench-device laws clean
 
 install: $(VENV)/installed $(VENV)/kernels
 
@@ -108,6 +108,10 @@ check-reference: install
 # Time of forward and backward steps compared with the authors', and its growth with mesh, batch and threads.
 bench-simulator: install
 	$(BIN)/python tests/bench/simulator.py $(SHARED)/reference
+
+# Compiled kernels beside tensors on a graphics card (DEVICE=cuda:1, cpu), for growing batches and meshes.
+bench-device: install
+	$(BIN)/python tests/bench/device.py $(if $(DEVICE),--device $(DEVICE))
 
 # Tracking and calibration on freshly rendered videos (SEED=number repeats one), compared with trackpy and OpenCV.
 bench-tracking: install

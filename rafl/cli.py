@@ -10,10 +10,12 @@ from rafl.batch.options import Batch, ClusterOption, JobsOption, OnOption, Print
 from rafl.common.command_line import create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
+from rafl.simulation.device import CPU, check_device_name
 
 METHODS = ("auto", "rafl", "srl", "sysid", "sysid-e", "sysid-damping", "sysid-loss", "sysid-branches", "constitutive")
 OBJECTIVES = ("image", "3d")
 INTEGRATORS = ("implicit-euler", "generalised-alpha")
+DEVICES = "Where to simulate: cpu, or cuda for a graphics card (cuda:1 for the second)."
 DATASET = "a dataset (.h5, written by rafl-capture)"
 
 fit_app = create_app("Fit a model to recordings.")
@@ -80,6 +82,7 @@ def fit(
     limit_energy: Annotated[
         bool, typer.Option(help="Limit the energy that the field adds to a motion by that in training (rafl).")
     ] = True,
+    device: Annotated[str, typer.Option(help=DEVICES)] = CPU,
     tensorboard: Annotated[
         bool, typer.Option("--tensorboard", help="Also write the history for TensorBoard into the run folder.")
     ] = False,
@@ -108,6 +111,7 @@ def fit(
         raise InputError(f"--integrator: expected {' or '.join(INTEGRATORS)}, found {integrator!r}")
     if objective and objective not in OBJECTIVES:
         raise InputError(f"--objective: expected {' or '.join(OBJECTIVES)}, found {objective!r}")
+    check_device_name(device, "--device")
     if frames == 1:
         raise InputError("--frames: expected 0 (all) or at least 2, found 1")
     for path in datasets:
@@ -139,6 +143,7 @@ def fit(
         "by_sigma": by_sigma,
         "objective": objective,
         "limit_energy": limit_energy,
+        "device": device,
     }
     commands.fit(datasets, out, method, tensorboard, resume, options)
 
@@ -151,6 +156,7 @@ def evaluate(
     ],
     out: Annotated[Path | None, typer.Option(help="Folder for errors.csv and report.html [the first run].")] = None,
     report: Annotated[bool, typer.Option(help="Write evaluation.h5 and report.html.")] = True,
+    device: Annotated[str, typer.Option(help=DEVICES)] = CPU,
     on: OnOption = None,
     jobs: JobsOption = None,
     cluster: ClusterOption = None,
@@ -172,6 +178,7 @@ def evaluate(
             f"expected at least one run folder and one dataset (.h5), found no {absent} among "
             f"{', '.join(map(str, paths))}; for instance rafl-eval runs/thick datasets/thick.h5"
         )
+    check_device_name(device, "--device")
     for run in runs:
         require_file(run / "model.pt", "a fitted model (written by rafl-fit)")
     for file in files:
@@ -184,4 +191,4 @@ def evaluate(
         return
     from rafl import commands
 
-    commands.evaluate(runs, files, out or runs[0], report)
+    commands.evaluate(runs, files, out or runs[0], report, device)

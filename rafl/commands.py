@@ -44,6 +44,7 @@ from rafl.fitting.quantities import METHOD_QUANTITIES, POISSON
 from rafl.fitting.run_folder import FittedModel, load_model
 from rafl.fitting.sysid import parameter_sentences
 from rafl.fitting.train_field import Report
+from rafl.simulation.device import require_device
 
 LABELS = {"missing": "residual targets not met"}  # of columns of the history, where its name says too little
 TORCH_THREADS = 1  # the network is small; the other cores run the element kernels
@@ -66,6 +67,7 @@ def fit(
         InputError: the datasets, the run folder or the options do not fit the method.
         typer.Exit: a simulation failed, or another process that torchrun started has ended; code 1.
     """
+    require_device(options["device"], "--device")
     torch.set_num_threads(TORCH_THREADS)
     first = rank() == 0  # of the processes that torchrun started
     if first:
@@ -163,7 +165,7 @@ def _describe(model: FittedModel) -> str:
     return " on ".join(parts) + integration
 
 
-def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool) -> None:
+def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool, device: str) -> None:
     """Simulate every recording with the baseline simulator and every model; write tables and a report.
 
     Args:
@@ -171,16 +173,19 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool) ->
         files: dataset files.
         folder: where errors.csv, motions.csv, errors.tex, evaluation.h5 and report.html are written.
         report: whether evaluation.h5 and report.html are written.
+        device: of the simulations.
 
     Raises:
-        InputError: a run or a dataset cannot be read, or a model is applicable to none of the datasets.
+        InputError: there is no such device, a run or a dataset cannot be read, or a model is applicable to none of the
+            datasets.
         typer.Exit: a simulation failed; code 1.
     """
+    require_device(device, "--device")
     torch.set_num_threads(TORCH_THREADS)
     announce_compilation()
     require_writable(folder)
     models = _models_by_name(runs)
-    datasets = [read_dataset(path) for path in files]
+    datasets = [read_dataset(path).on_device(device) for path in files]
     try:
         comparisons, failed = _compare_all(datasets, models)
     except SimulationError as error:

@@ -195,6 +195,8 @@ def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Pat
     assert_refused(run("rafl-fit", "a.h5"), "a.h5", "cannot be read")
 
     write_dataset(tmp_path / "a.h5", built)
+    assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--device", "gpu"), "--device", "cpu, cuda", "'gpu'")
+    assert not (tmp_path / "run").exists()
     assert_refused(run("rafl-eval", "a.h5"), "at least one run folder and one dataset", "no run folder")
     (tmp_path / "odd").mkdir()
     (tmp_path / "odd" / "config.yaml").write_bytes(b"\xff\xfe")
@@ -211,6 +213,8 @@ def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Pat
     assert run(*again).returncode == 0
     write_dataset(tmp_path / "a.h5", replace(built, recipe="another"))
     assert_refused(run(*again), "run", "a.h5 has changed", "choose another --out")
+    assert_refused(run("rafl-eval", "run", "a.h5", "--out", "out", "--device", "cuda:99"), "a CUDA device, found")
+    assert not (tmp_path / "out").exists()
     (tmp_path / "run" / "model.pt").write_bytes(b"x")
     assert_refused(run("rafl-eval", "run", "a.h5"), "model.pt", "cannot be read")
 

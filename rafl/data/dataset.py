@@ -114,6 +114,14 @@ class Dataset:
             f"{len(self.simulator.mesh.vertices)} vertices)"
         )
 
+    def on_device(self, device: str) -> "Dataset":
+        """The dataset with its simulator on a device; see `rafl.simulation.simulator.Simulator.on_device`.
+
+        Raises:
+            InputError: there is no such device.
+        """
+        return replace(self, simulator=self.simulator.on_device(device))
+
     def split(self, name: str) -> list[str]:
         """Names of the recordings of a split, in order."""
         return [key for key, item in self.trajectories.items() if item.split == name]

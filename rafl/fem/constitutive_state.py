@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[Any]
+Array = Any  # NumPy arrays or, placed on the device of an engine, torch tensors
 
 # Columns of `moduli`. Internal forces are linear in each.
 MODULI = ("mu", "lambda", "stiffness damping times rest mu", "stiffness damping times rest lambda")

@@ -16,6 +16,7 @@ from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs
 from rafl.fitting.run_folder import HISTORY_FILE, SETTINGS_FILE, FittedModel, Settings, read_settings, write_settings
 from rafl.fitting.train_field import Report, pretraining_unavailable, training_items
 from rafl.fitting.warm_start import MAX_VERTICES
+from rafl.simulation.device import CPU, require_device
 
 
 def fit(
@@ -40,6 +41,7 @@ def fit(
     objective: Objective = "",
     integrator: str = "",
     limit_energy: bool = True,
+    device: str = CPU,
 ) -> FittedModel:
     """Fit a model to the `train` recordings of datasets and keep the one with the least `val` error.
 
@@ -71,16 +73,18 @@ def fit(
             where the datasets have them.
         integrator: `implicit-euler` or `generalised-alpha`; that of the datasets if empty.
         limit_energy: whether the energy that a field adds to a motion is limited by what it added in training.
+        device: `cpu`, or a graphics card: `cuda`, or `cuda:1`. A run may be resumed on another device.
 
     Raises:
-        InputError: a file, the run folder or an option does not suit the method.
+        InputError: there is no such device; or a file, the run folder or an option does not suit the method.
         SimulationError: the simulator did not converge; the message names recording and step.
         OtherProcessError: another process that torchrun started has ended.
     """
     paths = [Path(path) for path in ([datasets] if isinstance(datasets, str | Path) else datasets)]
     with process_group() as group, ExitStack() as stack:
         with group.fail_together():
-            loaded = [read_dataset(path) for path in paths]
+            require_device(device)
+            loaded = [read_dataset(path).on_device(device) for path in paths]
             settings = Settings(
                 method=method,
                 datasets=tuple(str(path.resolve()) for path in paths),

@@ -67,10 +67,7 @@ class ResidualField(nn.Module):
 
     def forward(self, inputs: Tensor) -> Tensor:
         """Co-rotated accelerations (..., 3) from features (..., 34)."""
-        *hidden, last = self.weights()
-        for matrix in hidden:
-            inputs = nn.functional.elu(inputs @ matrix.T)
-        return inputs @ last.T
+        return _outputs(inputs, self.weights())
 
     def weights(self, precision: torch.dtype = torch.float64) -> list[Tensor]:
         """Effective weight matrices: mirrored, with the feature scale in the first; differentiable."""
@@ -93,22 +90,11 @@ class ResidualField(nn.Module):
 
         `precision` is that of the network. Training uses `torch.float32`, which takes three fifths of the time.
         """
-        if simulator.arithmetic == "plain":
-            return self.reference_on(simulator)
-        points, weights = FieldPoints.of(simulator), self.weights(precision)
+        weights = self.weights(precision)
+        if simulator.arithmetic == "torch":
+            return _tensor_force(simulator, weights)
+        points = FieldPoints.of(simulator)
         return lambda q, v, external: field_force(q, v, points, *weights)
-
-    def reference_on(self, simulator: Simulator) -> ResidualForce:
-        """Reference implementation of `on` in plain tensors."""
-        points = GaussPoints.of(simulator.mesh, simulator.material.density)
-        gravity = torch.tensor(simulator.gravity, dtype=torch.float64)
-
-        def force(q: Tensor, v: Tensor, external: Tensor) -> Tensor:
-            inputs, rotation = features(q, v, points, gravity)
-            acceleration = (rotation @ self(inputs)[..., None])[..., 0]
-            return points.accumulate(acceleration, q.shape[1])
-
-        return force
 
     def set_scale(self, size: Tensor) -> None:
         """Set `scale` from the root mean square of each feature over training states, `size` (34).
@@ -122,3 +108,26 @@ class ResidualField(nn.Module):
             group_size = size[group].square().mean().sqrt()
             if group_size > MIN_GROUP_SIZE:
                 self.scale[group] = (size[group].clamp_min(MIN_RELATIVE_SIZE * group_size) * group_size).rsqrt()
+
+
+def _outputs(inputs: Tensor, weights: list[Tensor]) -> Tensor:
+    """Outputs (..., 3) of the network from features (..., 34)."""
+    *hidden, last = weights
+    for matrix in hidden:
+        inputs = nn.functional.elu(inputs @ matrix.T)
+    return inputs @ last.T
+
+
+def _tensor_force(simulator: Simulator, weights: list[Tensor]) -> ResidualForce:
+    """The force of a field in tensors, on the device of a simulator: the specification of the kernels."""
+    points = GaussPoints.of(simulator.mesh, simulator.material.density, simulator.device)
+    gravity = torch.tensor(simulator.gravity, dtype=torch.float64, device=simulator.device)
+    placed = [matrix.to(simulator.device) for matrix in weights]
+
+    def force(q: Tensor, v: Tensor, external: Tensor) -> Tensor:
+        inputs, rotation = features(q.to(simulator.device), v.to(simulator.device), points, gravity)
+        local = _outputs(inputs.to(placed[0].dtype), placed).double()
+        acceleration = (rotation @ local[..., None])[..., 0]
+        return points.accumulate(acceleration, q.shape[1]).to(q.device)
+
+    return force

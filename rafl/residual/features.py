@@ -4,24 +4,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from numba import njit, prange
-from numpy.typing import NDArray
 from torch import Tensor
 
 from rafl.fem.mesh import HexMesh
-from rafl.fem.svd import signed_svd
-
-Array = NDArray[Any]
+from rafl.fem.tensors.svd import signed_svd
 
 FEATURES = 34
-
-
-@njit(cache=True, parallel=True)
-def _batched_svd(F: Array, U: Array, s: Array, V: Array) -> None:
-    for index in prange(F.shape[0]):
-        signed_svd(F[index], U[index], s[index], V[index])
 
 
 class _PolarDecomposition(torch.autograd.Function):
@@ -33,13 +22,9 @@ class _PolarDecomposition(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, F: Tensor) -> tuple[Tensor, Tensor]:
-        array = F.detach().numpy()
-        U, V = np.empty_like(array), np.empty_like(array)
-        s = np.empty(array.shape[:-1])
-        _batched_svd(np.ascontiguousarray(array), U, s, V)
-        left, stretch, right = (torch.from_numpy(part) for part in (U, s, V))
-        ctx.save_for_backward(left, stretch, right)
-        return left @ right.mT, stretch.flip(-1)
+        U, s, V = signed_svd(F)
+        ctx.save_for_backward(U, s, V)
+        return U @ V.mT, s.flip(-1)
 
     @staticmethod
     def backward(ctx: Any, by_R: Tensor, by_s: Tensor) -> Tensor:
@@ -72,15 +57,11 @@ class GaussPoints:
     mass: Tensor
 
     @classmethod
-    def of(cls, mesh: HexMesh, density: float) -> "GaussPoints":
-        """Gauss points of a mesh with a density [kg/m^3]."""
+    def of(cls, mesh: HexMesh, density: float, device: str = "cpu") -> "GaussPoints":
+        """Gauss points of a mesh with a density [kg/m^3], on a torch device."""
         rule = mesh.quadrature
-        return cls(
-            torch.from_numpy(mesh.hexes),
-            torch.from_numpy(rule.shape),
-            torch.from_numpy(rule.gradient),
-            torch.from_numpy(density * rule.volume),
-        )
+        arrays = (mesh.hexes, rule.shape, rule.gradient, density * rule.volume)
+        return cls(*(torch.from_numpy(array).to(device) for array in arrays))
 
     def accumulate(self, acceleration: Tensor, nodes: int) -> Tensor:
         """Nodal forces [N], (B, N, 3), from accelerations [m/s^2], (B, E, 8, 3) (paper, accumulation eq.)."""
@@ -113,7 +94,7 @@ def features(q: Tensor, v: Tensor, points: GaussPoints, gravity: Tensor) -> tupl
     L = R.mT @ rate @ (cofactor / determinant[..., None])
     D = 0.5 * (L + L.mT)
     W = 0.5 * (L - L.mT)
-    identity = torch.eye(3, dtype=q.dtype)
+    identity = torch.eye(3, dtype=q.dtype, device=q.device)
     diagonal = D.diagonal(dim1=-2, dim2=-1)
     trace = diagonal.sum(-1, keepdim=True)
     shear = D - trace[..., None] / 3.0 * identity

@@ -197,7 +197,7 @@ def _by_moduli(engine: Engine, q: Array, state: ConstitutiveState, adjoint: Arra
 
     The internal force at the integration points is linear in each modulus.
     """
-    out = np.zeros_like(state.moduli)
+    out: Array = np.zeros_like(state.moduli)
     hourglass = state.hourglass
     if hourglass is not None:
         none = np.zeros_like(hourglass.elastic)

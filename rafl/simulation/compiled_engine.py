@@ -15,6 +15,7 @@ from rafl.fem.enhanced.hourglass import HourglassModes
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule
 from rafl.simulation.compiled_elements import CompiledElements, EnhancedElements, PointElements
+from rafl.simulation.engine import solve_once
 from rafl.solvers.choose import choose_linear_solver
 from rafl.solvers.linear import Factors, LinearSolver
 
@@ -68,6 +69,10 @@ class CompiledEngine:
         """Flat indices into (N * 3) of the unknowns, in the solver's order, (n)."""
         return self.linear_solver.free_index
 
+    def place(self, state: ConstitutiveState) -> ConstitutiveState:
+        """The state itself: the kernels take arrays."""
+        return state
+
     def evaluate(
         self, q: Array, state: ConstitutiveState, *, tangent: bool, project: bool = False
     ) -> tuple[Array, Array, Array]:
@@ -120,14 +125,10 @@ class CompiledEngine:
 
     def solve_once(self, tangents: Array, diagonal: Array, right: Array) -> Array:
         """Solutions (B, C, n) with tangents, possibly indefinite, plus a diagonal (B, n)."""
-        rows = np.arange(len(right))
         if self._reused is None or len(self._reused.ready) != len(right):
             self._reused = self.allocate(len(right))
-        factors = self._reused
-        definite = self.factor(factors, rows, tangents, diagonal)
-        solution = np.empty_like(right)
-        if definite.any():
-            solution[definite] = self.solve(factors, rows[definite], right[definite])
-        for t in np.flatnonzero(~definite):
-            solution[t] = self.linear_solver.solve_indefinite(tangents[t], diagonal[t], right[t])
-        return solution
+
+        def solve_indefinite(row: int) -> Array:
+            return self.linear_solver.solve_indefinite(tangents[row], diagonal[row], right[row])
+
+        return solve_once(self, self._reused, tangents, diagonal, right, solve_indefinite)

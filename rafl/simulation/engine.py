@@ -1,5 +1,6 @@
-"""Interface of the numerical engines: `rafl.simulation.compiled_engine` and `rafl.simulation.reference_engine`."""
+"""Interface of the numerical engines: `rafl.simulation.compiled_engine` and `rafl.simulation.torch_engine`."""
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
@@ -29,6 +30,9 @@ class Engine(Protocol):
     @property
     def factorisation_cost(self) -> float:
         """Number of Newton steps with a reused factor that cost as much as a new factor."""
+
+    def place(self, state: ConstitutiveState) -> ConstitutiveState:
+        """The state in arrays of the engine's own kind, for many calls of `evaluate`, which takes both."""
 
     def evaluate(
         self, q: Array, state: ConstitutiveState, *, tangent: bool, project: bool = False
@@ -68,3 +72,22 @@ class Engine(Protocol):
 
     def solve_once(self, tangents: Any, diagonal: Array, right: Array) -> Array:
         """Solutions (B, C, n) with tangents, possibly indefinite, plus a diagonal (B, n)."""
+
+
+def solve_once(
+    engine: Engine,
+    factors: Factors,
+    tangents: Any,
+    diagonal: Array,
+    right: Array,
+    solve_indefinite: Callable[[int], Array],
+) -> Array:
+    """Solutions (B, C, n) by Cholesky factors, into `factors`, and by `solve_indefinite` of a trajectory (C, n)."""
+    rows = np.arange(len(right))
+    definite = engine.factor(factors, rows, tangents, diagonal)
+    solution = np.empty_like(right)
+    if definite.any():
+        solution[definite] = engine.solve(factors, rows[definite], right[definite])
+    for row in np.flatnonzero(~definite):
+        solution[row] = solve_indefinite(int(row))
+    return solution

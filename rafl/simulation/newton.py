@@ -92,11 +92,12 @@ def _minimise(
     max_stiffness = engine.quadrature.max_rest_stiffness(state.moduli)
     position_error = POSITION_ROUNDING * np.abs(q).max(axis=1)  # [m]
     tolerance = np.maximum(RESIDUAL_TOLERANCE, max_stiffness * position_error)
+    placed = engine.place(state)
     energy, largest, residual = np.empty(batch), np.empty(batch), np.empty_like(diagonal)
 
     def elastic(rows: Array, at: Array) -> tuple[Array, Array]:
         """Elastic energy (P) and its derivative (P, N, 3) at positions (P, 3 N)."""
-        own = state if len(rows) == batch else state.select(rows)
+        own = placed if len(rows) == batch else placed.select(rows)
         return engine.evaluate(at.reshape(-1, *shape), own, tangent=False)[:2]
 
     evaluate_start(q, *elastic(np.arange(batch), q), *loads, energy, residual, largest)
@@ -110,7 +111,8 @@ def _minimise(
         new = running[~reused]
         if len(new):
             at = q[new].reshape(-1, *shape)
-            _factor(engine, at, state.select(new), factors, new, diagonal[new], label, largest[new])
+            own = placed if len(new) == batch else placed.select(new)
+            _factor(engine, at, own, max_stiffness[new], factors, new, diagonal[new], label, largest[new])
         right = residual[running]
         step = -engine.solve(factors, running, right[:, None])[:, 0]
         slope = np.einsum("ij,ij->i", step, right)
@@ -165,6 +167,7 @@ def _factor(
     engine: Engine,
     q: Array,
     state: ConstitutiveState,
+    max_stiffness: Array,
     factors: Factors,
     rows: Array,
     diagonal: Array,
@@ -179,7 +182,7 @@ def _factor(
     # Use the smallest sufficient share: the projected tangent is far too stiff in the direction of buckling.
     exact = tangents[left]
     _, _, projected = engine.evaluate(q[left], state.select(left), tangent=True, project=True)
-    shift = 1e-9 * engine.quadrature.max_rest_stiffness(state.moduli[left])[:, None]
+    shift = 1e-9 * max_stiffness[left, None]
     for share in PROJECTION_SHARES:
         mixed = exact + share * (projected - exact)
         failed = ~engine.factor(factors, rows[left], mixed, diagonal[left] + shift)

@@ -1,6 +1,6 @@
 """Mechanics of one specimen: mesh, material, fixed nodes, gravity and time integration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -14,17 +14,18 @@ from rafl.fem.constitutive_state import ConstitutiveState, HourglassStiffness
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.compiled_engine import CompiledEngine
+from rafl.simulation.device import CPU, require_device
 from rafl.simulation.engine import Engine
 from rafl.simulation.newton import minimise
 from rafl.simulation.parameters import Parameters
-from rafl.simulation.reference_engine import ReferenceEngine
 from rafl.simulation.time_integration import INTEGRATORS
+from rafl.simulation.torch_engine import TorchEngine
 from rafl.solvers.linear import Factors
 
 Array = NDArray[Any]
 
 GRAVITY = (0.0, 0.0, -9.80709)  # [m/s^2]; the value of the paper's simulator
-ARITHMETIC = ("compiled", "plain")
+ARITHMETIC = ("compiled", "torch")
 MAX_GRAVITY_ACROSS = 0.02  # largest component of gravity normal to a symmetry plane, relative to its magnitude
 FIRST_LOAD_STEPS, MAX_LOAD_STEPS = 8, 64  # of an equilibrium whose load is applied in steps
 
@@ -41,9 +42,9 @@ class Simulator:
         gravity: [m/s^2], (3).
         integrator: one of `rafl.simulation.time_integration.INTEGRATORS`.
         substeps: number of integrator steps within dt.
-        arithmetic: `compiled` kernels on the CPU, or `plain` tensors on `device`. Both compute the same; the plain
-            tensors are the readable reference and run on GPUs.
-        device: torch device of the `plain` arithmetic.
+        arithmetic: `compiled` kernels on the CPU, or `torch` tensors on `device`. Both compute the same; the kernels
+            are faster on a CPU, and the tensors run on a graphics card too.
+        device: torch device of the `torch` arithmetic.
 
     Raises:
         ValueError: an unknown name, or a number out of range.
@@ -57,14 +58,14 @@ class Simulator:
     integrator: str = "implicit-euler"
     substeps: int = 1
     arithmetic: str = "compiled"
-    device: str = "cpu"
+    device: str = CPU
 
     def __post_init__(self) -> None:
         for key, known in (("integrator", tuple(INTEGRATORS)), ("arithmetic", ARITHMETIC)):
             if getattr(self, key) not in known:
                 raise ValueError(f"expected {key} to be one of {', '.join(known)}, got {getattr(self, key)!r}")
-        if self.device != "cpu" and self.arithmetic != "plain":
-            raise ValueError(f"expected arithmetic to be plain on device {self.device!r}, got {self.arithmetic!r}")
+        if self.device != CPU and self.arithmetic != "torch":
+            raise ValueError(f"expected arithmetic to be torch on device {self.device!r}, got {self.arithmetic!r}")
         fixed, nodes = np.asarray(self.fixed), len(self.mesh.vertices)
         if not (np.issubdtype(fixed.dtype, np.integer) and ((fixed >= 0) & (fixed < nodes)).all()):
             raise ValueError(
@@ -75,6 +76,15 @@ class Simulator:
         if not np.isfinite(self.gravity).all():
             raise ValueError(f"expected a finite gravity, got {self.gravity}")
 
+    def on_device(self, device: str) -> "Simulator":
+        """The same simulator on a device: compiled kernels on `cpu`, tensors on a graphics card (`cuda`, `cuda:1`).
+
+        Raises:
+            InputError: there is no such device.
+        """
+        require_device(device)
+        return replace(self, arithmetic="compiled" if device == CPU else "torch", device=device)
+
     @property
     def time_integration(self) -> dict[str, Any]:
         """Settings of the time integration, by attribute name."""
@@ -84,8 +94,8 @@ class Simulator:
     def engine(self) -> Engine:
         """Energy, gradient, tangent and linear solves."""
         material = self.material
-        if self.arithmetic == "plain":
-            return ReferenceEngine(self.mesh, material.law, material.integration, self.fixed, self.device)
+        if self.arithmetic == "torch":
+            return TorchEngine(self.mesh, material.law, material.integration, self.fixed, self.device)
         return CompiledEngine(self.mesh, material.law, material.integration, self.fixed)
 
     @cached_property

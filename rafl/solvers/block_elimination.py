@@ -1,6 +1,6 @@
 """Block elimination of a block-tridiagonal matrix, for bodies of varying cross-section."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
@@ -9,13 +9,13 @@ from typing import Any
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import reverse_cuthill_mckee
 from threadpoolctl import ThreadpoolController
 
 from rafl.fem.mesh import HexMesh
 from rafl.solvers import blas
 from rafl.solvers.band import scatter_entries
-from rafl.solvers.linear import Factors, FreeUnknowns, free_nodes, node_graph, solve_by_sparse_lu
+from rafl.solvers.level_sets import LevelSets
+from rafl.solvers.linear import Factors, FreeUnknowns, solve_by_sparse_lu
 
 Array = NDArray[Any]
 
@@ -35,24 +35,19 @@ class _Level:
 class BlockElimination:
     """Cholesky factors of a block-tridiagonal matrix, by block elimination from both ends to the middle.
 
-    The blocks are breadth-first level sets of the mesh graph. They start next to the fixed nodes, at an end of
-    the longest side or at a peripheral node, whichever costs least. The cost depends on the size of each cross-section,
-    not only on the largest, so this suits bodies with a thin waist. `work` estimates the multiplications of a
+    The blocks are the level sets of `rafl.solvers.level_sets`. The cost depends on the size of each cross-section, not
+    only on the largest, so this suits bodies with a thin waist. `work` estimates the multiplications of a
     factorisation.
     """
 
     factorisation_cost = 7.0
 
     def __init__(self, mesh: HexMesh, fixed: NDArray[np.int64]) -> None:
-        free = free_nodes(mesh, fixed)
-        sizes, order = min(
-            (_level_sets(mesh, free, seeds) for seeds in _candidate_seeds(mesh, free, fixed)),
-            key=lambda level_sets: _work(level_sets[0]),
-        )
-        self.unknowns = FreeUnknowns(mesh, order)
+        found = LevelSets.of(mesh, fixed)
+        sizes, middle = found.sizes, found.middle
+        self.unknowns = FreeUnknowns(mesh, found.order)
         self.free_index = self.unknowns.free_index
-        self.work = _work(sizes)
-        middle = min(range(len(sizes)), key=lambda k: max(_work(sizes[: k + 1]), _work(sizes[k:][::-1])))
+        self.work = found.work
         self._middle = middle
         self._sides = (range(middle), range(len(sizes) - 1, middle, -1))  # each from its outermost level
         ends, offset = np.cumsum(sizes), 0
@@ -167,47 +162,6 @@ class BlockElimination:
 
 def _level_size(level: _Level) -> int:
     return int(level.unknowns.stop - level.unknowns.start)
-
-
-def _work(sizes: list[int]) -> float:
-    """Multiplications to eliminate levels of these sizes in sequence."""
-    pairs = zip(sizes, [*sizes[1:], 0], strict=True)
-    return sum(s**3 / 3 + s * s * following + s * following * following for s, following in pairs)
-
-
-def _candidate_seeds(mesh: HexMesh, free: NDArray[np.int64], fixed: NDArray[np.int64]) -> Iterable[NDArray[np.int64]]:
-    """Candidate sets of free nodes (indices into `free`) to start the level sets from."""
-    graph = node_graph(mesh, free)
-    yield np.array([reverse_cuthill_mckee(graph, symmetric_mode=True)[0]])
-    along = mesh.vertices[free, np.argmax(np.ptp(mesh.vertices, axis=0))]
-    yield np.flatnonzero(along < along.min() + 1e-6 * np.ptp(along))
-    cells_at_fixed = np.isin(mesh.hexes, fixed).any(axis=1)
-    next_to_fixed = np.flatnonzero(np.isin(free, mesh.hexes[cells_at_fixed]))
-    if len(next_to_fixed):
-        yield next_to_fixed
-
-
-def _level_sets(
-    mesh: HexMesh, free: NDArray[np.int64], seeds: NDArray[np.int64]
-) -> tuple[list[int], NDArray[np.int64]]:
-    """Number of unknowns in each breadth-first level from `seeds`, and the free nodes sorted by level."""
-    graph = node_graph(mesh, free)
-    level = np.full(len(free), -1)
-    current, count = seeds, 0
-    reached = np.zeros(len(free), dtype=bool)
-    while True:
-        while len(current):
-            level[current] = count
-            reached[current] = True
-            count += 1
-            neighbours = np.unique(graph[current].indices)
-            current = neighbours[~reached[neighbours]]
-        unreached = np.flatnonzero(~reached)
-        if not len(unreached):
-            break
-        current = unreached[:1]  # start again in a component of the graph not yet reached
-    sizes = [3 * int(n) for n in np.bincount(level)]
-    return sizes, free[np.argsort(level, kind="stable")]
 
 
 @cache

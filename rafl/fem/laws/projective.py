@@ -15,6 +15,9 @@ from torch import Tensor
 from rafl.fem.kernel_layout import ENERGY, FIRST, FLIP, SECOND, STRETCH, TEMPORARY
 from rafl.fem.simd import KERNEL_OPTIONS
 
+NEWTON_STEPS = 5  # stretches within 10 % of 1 need four
+CONVERGED = 1e-14  # of the product of the stretches p
+
 
 def rest_lame(mu: Tensor, lam: Tensor) -> tuple[Tensor, Tensor]:
     """Lame parameters of the law's linearisation at rest."""
@@ -32,8 +35,26 @@ def _constrained_stretches(s: Tensor, kappa: Tensor, on_lower_branch: Tensor) ->
 def reference_projection(s: Tensor) -> tuple[Tensor, Tensor]:
     """Tensor version of `volume_projection`: kappa (...) and p (..., 3) for s (..., 3), descending.
 
-    Solves sum log p = 0 for kappa by bisection and some Newton steps. The sum decreases with kappa on the upper
-    branch and increases on the lower one.
+    A few Newton steps find kappa at all points together, and bisection where p_0 p_1 p_2 does not reach 1.
+    """
+    volume, upper = s.prod(-1), torch.zeros(s.shape[:-1], dtype=torch.bool, device=s.device)
+    kappa = 2.0 * (volume - 1.0) / ((volume + 1.0) * s.square().reciprocal().sum(-1))
+    for _ in range(NEWTON_STEPS):
+        p = 0.5 * (s + (s * s - 4.0 * kappa[..., None]).sqrt())
+        volume = p.prod(-1)
+        # 2 (x - 1) / (x + 1) approximates log x to third order, and log x is nearly linear in kappa.
+        kappa = kappa + 2.0 * (volume - 1.0) / (volume + 1.0) / (p * p - kappa[..., None]).reciprocal().sum(-1)
+    p = _constrained_stretches(s, kappa, upper)
+    left = ~((p.prod(-1) - 1.0).abs() < CONVERGED)
+    if left.any():
+        kappa[left], p[left] = _bisected_projection(s[left])
+    return kappa, p
+
+
+def _bisected_projection(s: Tensor) -> tuple[Tensor, Tensor]:
+    """`reference_projection` of any stretches s (..., 3), by bisection and some Newton steps.
+
+    The sum of log p decreases with kappa on the upper branch and increases on the lower one.
     """
     smallest = s[..., 2]
     limit = 0.25 * smallest.clamp_min(0.0) ** 2

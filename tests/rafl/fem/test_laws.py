@@ -240,13 +240,13 @@ def test_laws_share_one_kernel(own_law: str) -> None:
 
 
 @pytest.mark.parametrize("integration", ["full", "selective"])
-def test_own_law_in_compiled_and_plain_arithmetic(own_law: str, integration: str, random: np.random.Generator) -> None:
+def test_own_law_in_kernels_and_tensors(own_law: str, integration: str, random: np.random.Generator) -> None:
     """Trajectories agree to 1e-10, gradients by E and nu to 1e-8."""
     mesh = HexMesh.box((3, 1, 1), (0.06, 0.02, 0.02))
     material = Material(1e5, 0.4, mass="lumped", law=own_law, integration=integration, viscosity=10.0)
     kick = torch.tensor(random.normal(0, 0.3, (1, *mesh.vertices.shape)))
     found = []
-    for arithmetic in ("compiled", "plain"):
+    for arithmetic in ("compiled", "torch"):
         simulator = Simulator(mesh, material, mesh.face_nodes("x-min"), arithmetic=arithmetic)
         values = {
             "youngs_modulus": torch.tensor(1e5, dtype=torch.float64, requires_grad=True),
@@ -256,10 +256,10 @@ def test_own_law_in_compiled_and_plain_arithmetic(own_law: str, integration: str
         q, _ = rollout(simulator, start, 5, parameters=simulator.parameters(**values))
         (q[-1] ** 2).sum().backward()
         found.append((q.detach(), *(value.grad for value in values.values())))
-    for compiled, plain, tolerance in zip(*found, (1e-10, 1e-8, 1e-8), strict=True):
+    for compiled, tensors, tolerance in zip(*found, (1e-10, 1e-8, 1e-8), strict=True):
         assert compiled is not None
-        assert float((compiled - plain).abs().max()) < tolerance * float(plain.abs().max())
-        assert float(plain.abs().max()) > 0
+        assert float((compiled - tensors).abs().max()) < tolerance * float(tensors.abs().max())
+        assert float(tensors.abs().max()) > 0
 
 
 def test_gradient_by_the_modulus_of_an_own_law(own_law: str) -> None:

@@ -1,6 +1,9 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
+from devices import ON_DEVICES
 from scipy.spatial.transform import Rotation
 
 from rafl.fem.material import Material
@@ -144,9 +147,12 @@ def test_force_by_finite_differences(field: tuple[ResidualField, Simulator], ran
     assert float((q.grad * dq + v.grad * dv).sum()) == pytest.approx(float(slope), rel=1e-5)
 
 
+@ON_DEVICES
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("at_rest", [True, False])
-def test_compiled_and_reference_fields_agree(at_rest: bool, mirrored: bool, random: np.random.Generator) -> None:
+def test_fields_in_kernels_and_tensors_agree(
+    at_rest: bool, mirrored: bool, device: str, random: np.random.Generator
+) -> None:
     """Forces and all derivatives of several deformed states, and at rest, on a mesh with a missing cell."""
     torch.manual_seed(1)
     model = ResidualField()
@@ -161,15 +167,15 @@ def test_compiled_and_reference_fields_agree(at_rest: bool, mirrored: bool, rand
     v = torch.tensor(random.normal(0, 0.3, q.shape) * (not at_rest))
     c = torch.tensor(random.normal(size=q.shape))
     results = []
-    for force in (model.on(simulator), model.reference_on(simulator)):
+    for force in (model.on(simulator), model.on(replace(simulator, arithmetic="torch", device=device))):
         leaves = [q.clone().requires_grad_(), v.clone().requires_grad_()]
         value = force(*leaves, 0 * q)
         results.append([value, *torch.autograd.grad((value * c).sum(), [*leaves, *model.parameters()])])
-    for number, (compiled, reference) in enumerate(zip(*results, strict=True)):
+    for number, (compiled, tensors) in enumerate(zip(*results, strict=True)):
         assert torch.isfinite(compiled).all()
         if at_rest and number == 1:
             continue  # for equal stretches the order, and so the derivative of each feature, is not unique
-        torch.testing.assert_close(compiled, reference, rtol=1e-8, atol=1e-11 * float(reference.detach().abs().max()))
+        torch.testing.assert_close(compiled, tensors, rtol=1e-8, atol=1e-11 * float(tensors.detach().abs().max()))
 
 
 def test_weights_by_finite_differences(field: tuple[ResidualField, Simulator], random: np.random.Generator) -> None:

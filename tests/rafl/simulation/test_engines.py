@@ -1,22 +1,30 @@
-"""Comparison of the compiled engine with the reference engine."""
+"""Comparison of the compiled kernels with the tensors, which are their specification."""
 
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from devices import ON_DEVICES
 from scipy.spatial.transform import Rotation
 
 from rafl.fem.constitutive_state import ConstitutiveState, HourglassStiffness
 from rafl.fem.laws import LAWS
+from rafl.fem.learned_energy import UNITS as ENERGY_UNITS
+from rafl.fem.learned_viscosity import UNITS as VISCOSITY_UNITS
 from rafl.fem.material import INTEGRATION_SCHEMES, Material
 from rafl.fem.mesh import HexMesh
+from rafl.simulation import torch_engine
 from rafl.simulation.compiled_engine import CompiledEngine
-from rafl.simulation.reference_engine import ReferenceEngine
 from rafl.simulation.rollout import Start, rollout
 from rafl.simulation.simulator import Simulator
+from rafl.simulation.torch_engine import TorchEngine
 
-MESH = HexMesh.box((3, 2, 2), (0.06, 0.03, 0.03))
+CELLS = np.ones((4, 2, 2), dtype=bool)
+CELLS[2, 0] = CELLS[3, :, 1] = False  # a cross-section that varies
+GRID = HexMesh.from_grid(CELLS, (0.018, 0.015, 0.015))
+MESH = HexMesh(GRID.vertices * (1.0 + GRID.vertices[:, :1] * [0.0, 4.0, -3.0]), GRID.hexes)  # cells of several shapes
 FIXED = MESH.face_nodes("x-min")
 
 
@@ -31,8 +39,8 @@ def states(random: np.random.Generator) -> np.ndarray:
     return np.stack([rest, shaken, shaken @ turn.T, flat, inverted])
 
 
-def engines(law: str, integration: str) -> tuple[CompiledEngine, ReferenceEngine]:
-    return CompiledEngine(MESH, law, integration, FIXED), ReferenceEngine(MESH, law, integration, FIXED)
+def engines(law: str, integration: str, device: str) -> tuple[CompiledEngine, TorchEngine]:
+    return CompiledEngine(MESH, law, integration, FIXED), TorchEngine(MESH, law, integration, FIXED, device)
 
 
 def constitutive(
@@ -64,25 +72,45 @@ def constitutive(
     )
 
 
+@ON_DEVICES
 @pytest.mark.parametrize(("law", "integration", "damped"), list(product(LAWS, INTEGRATION_SCHEMES, (False, True))))
-def test_compiled_and_reference_engines_agree(
-    law: str, integration: str, damped: bool, random: np.random.Generator
+def test_both_engines_agree(
+    law: str, integration: str, damped: bool, device: str, random: np.random.Generator, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Energy, gradient, exact and projected tangents, and solutions, also if cells are evaluated a few at a time."""
     q = states(random)
     moduli = np.tile([7e4, 6e5], (len(q), 1)) * np.linspace(0.5, 1.5, len(q))[:, None]
-    compiled, reference = engines(law, integration)
+    compiled, tensors = engines(law, integration, device)
     state = constitutive(compiled, moduli, damped, random)
-    x = random.normal(size=q.shape)
+    x, inertia = random.normal(size=q.shape), np.repeat(random.uniform(2e3, 4e3, q.shape[:2]), 3, axis=1)
     for project in (False, True):
-        compiled_values = compiled.evaluate(q, state, tangent=True, project=project)
-        reference_values = reference.evaluate(q, state, tangent=True, project=project)
-        for found, expected in (
-            (compiled_values[0], reference_values[0]),
-            (compiled_values[1], reference_values[1]),
-            (compiled.multiply(compiled_values[2], x), reference.multiply(reference_values[2], x)),
-        ):
-            # Rounding is largest in the projected volume term of the inverted body.
-            assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
+        energy, gradient, tangents = compiled.evaluate(q, state, tangent=True, project=project)
+        whole = tensors.evaluate(q, tensors.place(state), tangent=True, project=project)
+        monkeypatch.setitem(torch_engine.POINTS_AT_ONCE, device, 5 * len(q) * len(compiled.quadrature.points.shape))
+        for own in (whole, tensors.evaluate(q, state, tangent=True, project=project)):
+            for found, expected in (
+                (energy, own[0]),
+                (gradient, own[1]),
+                (compiled.multiply(tangents, x), tensors.multiply(own[2], x)),
+                (compiled.reactions(tangents, x), tensors.reactions(own[2], x)),
+            ):
+                # Rounding is largest in the projected volume term of the inverted body.
+                assert np.abs(found - expected).max() < 1e-10 * np.abs(expected).max()
+        monkeypatch.undo()
+        found, expected = (
+            nodal_solution(engine, own, inertia, x) for engine, own in ((compiled, tangents), (tensors, whole[2]))
+        )
+        assert np.abs(found - expected).max() < 1e-8 * np.abs(expected).max()
+
+
+def nodal_solution(
+    engine: CompiledEngine | TorchEngine, tangents: Any, inertia: np.ndarray, x: np.ndarray
+) -> np.ndarray:
+    """Solution (B, N, 3) for a right-hand side x (B, N, 3) on the free nodes, with an inertia (B, 3 N)."""
+    free = engine.free_index
+    out = np.zeros((len(x), inertia.shape[1]))
+    out[:, free] = engine.solve_once(tangents, inertia[:, free], x.reshape(len(x), 1, -1)[..., free])[:, 0]
+    return out.reshape(x.shape)
 
 
 def test_gradient_and_tangent_by_finite_differences(random: np.random.Generator) -> None:
@@ -101,53 +129,76 @@ def test_gradient_and_tangent_by_finite_differences(random: np.random.Generator)
         assert np.abs(tangent_product - gradient_slope).max() < 1e-6 * np.abs(gradient_slope).max()
 
 
+@ON_DEVICES
 @pytest.mark.parametrize("integration", INTEGRATION_SCHEMES)
-def test_strains_of_both_engines_agree(integration: str, random: np.random.Generator) -> None:
+def test_strains_of_both_engines_agree(integration: str, device: str, random: np.random.Generator) -> None:
     """Strains, their change along a direction by finite differences, and the adjoint as the transpose of the change."""
-    compiled, reference = engines("corotated", integration)
+    compiled, tensors = engines("corotated", integration, device)
     q = states(random)[:3]
     direction = random.normal(size=q.shape)
     strain, change = compiled.strains(q, direction)
-    for found, expected in zip((strain, change), reference.strains(q, direction), strict=True):
+    for found, expected in zip((strain, change), tensors.strains(q, direction), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-11)
     h = 1e-7
     forward, backward = (compiled.strains(q + sign * h * direction, direction)[0] for sign in (1, -1))
     np.testing.assert_allclose(change, (forward - backward) / (2 * h), rtol=1e-5, atol=1e-6)
     weights = random.normal(size=strain.shape)
-    for engine in (compiled, reference):
+    for engine in (compiled, tensors):
         adjoint = engine.strains_adjoint(q, weights)
         assert (adjoint * direction).sum() == pytest.approx((weights * change).sum(), rel=1e-10)
 
 
-@pytest.mark.parametrize("integration", ["full", "enhanced"])
+@ON_DEVICES
+@pytest.mark.parametrize("learned", [False, True], ids=["damped", "learned"])
+@pytest.mark.parametrize("integration", ["full", "selective", "enhanced"])
 @pytest.mark.parametrize("integrator", ["implicit-euler", "generalised-alpha"])
 def test_trajectories_and_gradients_of_both_engines_agree(
-    integrator: str, integration: str, random: np.random.Generator
+    integrator: str, integration: str, learned: bool, device: str, random: np.random.Generator
 ) -> None:
     """On a damped batch: positions to a relative 1e-10, gradients to a relative 1e-8."""
     material = Material(
         1.5e5,
         0.45,
         mass="lumped",
-        law="corotated",
+        law="yeoh" if learned else "corotated",
         integration=integration,
         viscosity=20.0,
-        stiffness_damping=2e-3,
+        stiffness_damping=0.0 if learned else 2e-3,
         branch_shares=(0.1, 0.2),
         branch_times=(0.02, 0.3),
+        energy_weights=tuple(random.exponential(0.3, ENERGY_UNITS)) if learned else (),
+        dissipation_weights=tuple(random.exponential(0.02, VISCOSITY_UNITS)) if learned else (),
     )
     kick = torch.tensor(random.normal(0, 0.1, (2, *MESH.vertices.shape)))
+    names = ("poissons_ratio", "viscosity", "branch_shares", "energy_weights", "dissipation_weights")
     found = []
-    for arithmetic in ("compiled", "plain"):
-        simulator = Simulator(MESH, material, FIXED, integrator=integrator, arithmetic=arithmetic)
+    for arithmetic, own in (("compiled", "cpu"), ("torch", device)):
+        simulator = Simulator(MESH, material, FIXED, integrator=integrator, arithmetic=arithmetic, device=own)
         q = torch.from_numpy(np.stack([MESH.vertices] * 2)).requires_grad_()
-        parameters = simulator.parameters(youngs_modulus=torch.tensor([1e5, 2e5], requires_grad=True))
+        values = {name: torch.tensor(getattr(material, name), dtype=torch.float64).requires_grad_() for name in names}
+        values["youngs_modulus"] = torch.tensor([1e5, 2e5], dtype=torch.float64, requires_grad=True)
         start = Start(q, kick, torch.zeros_like(kick), torch.zeros(kick.shape[:2]), ("a", "b"))
-        positions, _ = rollout(simulator, start, 6, parameters=parameters)
-        (positions[-1] ** 2).sum().backward()
-        found.append((positions.detach(), q.grad, parameters.youngs_modulus))
-    (compiled, by_q, _), (reference, by_q_reference, _) = found
-    assert by_q is not None
-    assert by_q_reference is not None
-    assert float((compiled - reference).abs().max()) < 1e-10 * float(reference.abs().max())
-    assert float((by_q - by_q_reference).abs().max()) < 1e-8 * float(by_q_reference.abs().max())
+        positions, _ = rollout(simulator, start, 6, parameters=simulator.parameters(**values))
+        leaves = [q, *(value for value in values.values() if value.numel())]
+        found.append([positions.detach(), *torch.autograd.grad((positions[-1] ** 2).sum(), leaves)])
+    for number, (compiled, tensors) in enumerate(zip(*found, strict=True)):
+        assert float(compiled.abs().max()) > 0
+        assert float((compiled - tensors).abs().max()) < (1e-8 if number else 1e-10) * float(compiled.abs().max())
+
+
+@ON_DEVICES
+@pytest.mark.parametrize("integration", ["full", "enhanced"])
+def test_equilibria_of_both_engines_agree(integration: str, device: str, random: np.random.Generator) -> None:
+    """Under loads that need projected tangents, one of them in several steps, to 1e-9 m."""
+    material = Material(1e5, 0.45, law="corotated", mass="lumped", integration=integration)
+    simulator = Simulator(MESH, material, FIXED)
+    tensors = Simulator(MESH, material, FIXED, arithmetic="torch", device=device)
+    tip = MESH.face_nodes("x-max")
+    force = np.repeat(simulator.weight[None], 3, axis=0)
+    force[0, tip, 2] -= 30.0 * np.abs(simulator.weight).sum() / len(tip)
+    force[1, tip, 0] -= 20.0 * np.abs(simulator.weight).sum() / len(tip)
+    expected = simulator.equilibrium(force)
+    assert np.abs(tensors.equilibrium(force) - expected).max() < 1e-9
+    right = random.normal(size=(3, *MESH.vertices.shape, 2))
+    solutions = [each.solve_tangent(expected, right) for each in (simulator, tensors)]
+    assert np.abs(solutions[1] - solutions[0]).max() < 1e-8 * np.abs(solutions[0]).max()

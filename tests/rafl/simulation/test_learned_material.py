@@ -1,4 +1,4 @@
-"""The learned strain energy and viscosity: against the plain engine, finite differences, and energy without load."""
+"""The learned strain energy and viscosity: against the tensors, finite differences, and energy without load."""
 
 from dataclasses import replace
 from typing import Any
@@ -50,10 +50,10 @@ def deformed(simulator: Simulator, seed: int, size: float = 3e-3) -> np.ndarray:
 @SEEDS
 def test_engines_agree(integration: str, seed: int) -> None:
     simulator = beam(learned_material(seed, integration))
-    plain = replace(simulator, arithmetic="plain")
+    tensors = replace(simulator, arithmetic="torch")
     q, direction = deformed(simulator, seed), deformed(simulator, seed + 100) - simulator.mesh.vertices
     results = []
-    for each in (simulator, plain):
+    for each in (simulator, tensors):
         state = each.constitutive_state(2)
         energy, gradient, tangents = each.engine.evaluate(q, state, tangent=True)
         results.append((energy, gradient, each.engine.multiply(tangents, direction)))

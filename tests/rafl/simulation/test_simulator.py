@@ -124,9 +124,9 @@ def test_failed_solve_names_trajectory_and_remedy() -> None:
     ("keywords", "expected"),
     [
         ({"integrator": "leapfrog"}, "integrator to be one of implicit-euler, generalised-alpha"),
-        ({"arithmetic": "gpu"}, "arithmetic to be one of compiled, plain"),
+        ({"arithmetic": "gpu"}, "arithmetic to be one of compiled, torch"),
         ({"substeps": 0}, "substeps >= 1"),
-        ({"device": "cuda"}, "arithmetic to be plain on device 'cuda'"),
+        ({"device": "cuda"}, "arithmetic to be torch on device 'cuda'"),
     ],
 )
 def test_unknown_settings_are_rejected(keywords: dict[str, object], expected: str) -> None:

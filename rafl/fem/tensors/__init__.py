@@ -1,0 +1,1 @@
+"""The mechanics of the cells in torch tensors, on any device."""
