@@ -39,9 +39,6 @@ Array = NDArray[Any]
 
 VELOCITY_WINDOW_FRAMES = 5  # the polynomial through all of them gives the velocity in the first frame
 SAME_PLACE = 1e-9  # [m]
-# First frames follow the cameras not quite linearly. They are fitted again until the cameras change by less than
-# some of their standard deviations.
-MAX_REFINEMENTS, SETTLED = 3, 1.0
 
 
 def build_dataset(
@@ -92,14 +89,12 @@ def build_dataset(
         recording = recordings[row.recording]
         registration = register(recording, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
         registered.append(Registered.of(specimen, recording, row, registration, settings))
-    dataset, changed = _with_recordings(empty, specimen, registered, known, settings, tick)
+    dataset = _with_recordings(empty, specimen, registered, known, settings, tick)
     found = None
-    for _ in range(MAX_REFINEMENTS if settings.refine_cameras else 0):
-        found = refine_cameras(dataset, specimen, registered, found, settings.forces == "surface")
+    if settings.refine_cameras:
+        found = refine_cameras(dataset, specimen, registered, settings.forces == "surface")
         changed = [item.with_changes(found.changes) for item in registered]
-        dataset, changed = _with_recordings(empty, specimen, changed, known, settings, lambda: None)
-        if found.moved < SETTLED:
-            break
+        dataset = _with_recordings(empty, specimen, changed, known, settings, lambda: None)
     trajectories = {
         item.row.recording: _with_attributes(
             dataset.trajectories[item.row.recording], change_attributes(found, item, dataset.markers.rest)
@@ -121,14 +116,14 @@ def _with_recordings(
     known: Markers | None,
     settings: CaptureSettings,
     tick: Callable[[], None],
-) -> tuple[Dataset, list[Registered]]:
-    """The dataset with markers at their places and with recordings whose first frames are fitted; the latter."""
+) -> Dataset:
+    """The dataset with markers at their places and with recordings whose first frames are fitted."""
     markers, registered = find_dataset_places(empty, specimen, registered, known, settings)
     empty, trajectories = replace(empty, markers=markers), {}
     for item in registered:
         trajectories[item.row.recording] = _with_modulus(_trajectory(empty, specimen, item, settings), empty, specimen)
         tick()
-    return replace(empty, trajectories=trajectories), registered
+    return replace(empty, trajectories=trajectories)
 
 
 def _common_time_step(recordings: dict[str, Recording]) -> float:

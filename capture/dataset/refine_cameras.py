@@ -36,7 +36,7 @@ LEAST_PLACE_SIGMA = 1e-7  # of a place that is exactly known [m]
 QUANTITIES = METHOD_QUANTITIES["sysid-loss"]
 RECORDINGS = 2  # of the largest and the least motion; more hardly tell more
 FRAME_SHARES = 0.4, 1.0  # a search over many oscillations starts near its end
-LINEARISATIONS, STEPS, HALVINGS = 4, 4, 5
+LINEARISATIONS, STEPS, HALVINGS = 10, 4, 5
 SETTLED = 0.1  # a step of fewer standard deviations ends the search
 MATERIAL_STEP = 1e-4  # of a variable, for differences
 FIRST_FRAME_STEP = 1e-6  # root mean square motion of the nodes, for differences [m]
@@ -51,14 +51,10 @@ class Refinement:
 
     Attributes:
         changes: by camera.
-        moved: largest change of this search over its standard deviation.
-        material: variables of the material that were found with them.
         unexplained: root mean square difference of a coordinate of the pixels that remains, by camera [px].
     """
 
     changes: dict[str, CameraChange]
-    moved: float
-    material: Array
     unexplained: dict[str, float]
 
 
@@ -66,7 +62,6 @@ def refine_cameras(
     dataset: Dataset,
     specimen: Specimen,
     registered: list[Registered],
-    before: Refinement | None,
     whole_surface: bool,
 ) -> Refinement:
     """Find the cameras' changes from the training recordings that start at rest.
@@ -78,10 +73,9 @@ def refine_cameras(
     the model last, and tell less than their number.
 
     Args:
-        dataset: built with the cameras as changed before.
+        dataset: built with the cameras as calibrated.
         specimen: its description.
         registered: recordings of the dataset, with their cameras as calibrated.
-        before: changes so far; None at first.
         whole_surface: whether virtual forces act on the whole surface.
 
     Raises:
@@ -107,9 +101,9 @@ def refine_cameras(
     motion = Recordings.of(dataset, [item.row.recording for item in usable]).square_motion
     ranks = np.round(np.linspace(len(usable) - 1, 0, min(RECORDINGS, len(usable)))).astype(int)
     chosen = [usable[k] for k in np.argsort(motion)[ranks]]
-    search = _Search(dataset, specimen, chosen, before, whole_surface)
+    search = _Search(dataset, specimen, chosen, whole_surface)
     x = search.begin
-    for share in FRAME_SHARES if before is None else FRAME_SHARES[-1:]:
+    for share in FRAME_SHARES:
         x, covariance = search.minimise(x, share)
     return search.refinement(x, covariance)
 
@@ -126,7 +120,6 @@ class _Search:
         dataset: Dataset,
         specimen: Specimen,
         chosen: list[Registered],
-        before: Refinement | None,
         whole_surface: bool,
     ) -> None:
         self.dataset, markers = dataset, dataset.markers
@@ -164,13 +157,8 @@ class _Search:
                 np.repeat(places, 3),
             ]
         )
-        changes = {} if before is None else before.changes
-        self.built = {name: changes[name].value if name in changes else np.zeros(7) for name in self.cameras}
         start, mean = np.zeros((2, ends[-1]))
-        mean[self.material] = self._assumed(chosen)
-        start[self.material] = mean[self.material] if before is None else before.material
-        for name, own in zip(self.cameras, self.poses, strict=True):
-            start[own] = self.built[name]
+        start[self.material] = mean[self.material] = self._assumed(chosen)
         mean[self.places] = 0.0 if markers.moved is None else -markers.moved.ravel()
         self.begin, self.mean = start / self.scale, mean / self.scale
         self.low, self.high = np.full((2, len(start)), [[-FARTHEST], [FARTHEST]])
@@ -222,18 +210,16 @@ class _Search:
 
     def refinement(self, x: Array, covariance: Array) -> Refinement:
         """The changes of the cameras at variables x."""
-        changes, moved = {}, 0.0
+        changes = {}
         for name, own in zip(self.cameras, self.poses, strict=True):
             scale = self.scale[own]
-            sigma = scale[:, None] * covariance[own, own] * scale
-            changes[name] = CameraChange(x[own] * scale, self.centre, sigma)
-            moved = max(moved, float((np.abs(x[own] * scale - self.built[name]) / np.sqrt(np.diag(sigma))).max()))
+            changes[name] = CameraChange(x[own] * scale, self.centre, scale[:, None] * covariance[own, own] * scale)
         markers, q = self._simulated(self.recordings, x[None])
         placed, unexplained = self._placed(markers[:, 0], self._place_gain(q), x), {}
         for name, term in zip(self.cameras, self._terms(self.recordings, x), strict=True):
             gaps = term.gap(placed)[term.seen > 0]
             unexplained[name] = float(gaps.square().mean().sqrt())
-        return Refinement(changes, moved, (x * self.scale)[self.material], unexplained)
+        return Refinement(changes, unexplained)
 
     def _simulated(self, recordings: Recordings, sets: Array) -> tuple[Tensor, Tensor]:
         """Markers (T, S, R, M, 3) [m] of sets of variables (S, n) at their places as built, and node positions."""
@@ -258,8 +244,8 @@ class _Search:
         """What the cameras measured, as seen with their changes at x and the times of release."""
         late, result = torch.from_numpy((x * self.scale)[self.releases]), []
         for name, change, cameras in zip(self.cameras, self._changes(x), self.calibrated, strict=True):
-            term, later = recordings.terms[name], change.value[CLOCK] - self.built[name][CLOCK]
-            lag = term.lag - (later + late) / self.step
+            term = recordings.terms[name]
+            lag = term.lag - (change.value[CLOCK] + late) / self.step
             lag[0] = 0.0  # at rest
             result.append(replace(term, cameras=[change.moved(camera) for camera in cameras], lag=lag))
         return result
