@@ -16,7 +16,10 @@ from rafl.data.dataset import Dataset
 Array = NDArray[Any]
 
 PREFIX = "camera_change_"  # of the names of attributes
-MAX_SIGMAS = 3.0  # a larger change is more than the calibration's uncertainty
+MAX_SIGMAS = 3.0  # a larger change of the pixels is more than the calibration's uncertainty
+# Squared length of a change of the pose, in standard deviations, that is exceeded by chance as rarely as 3 sigmas: of a
+# chi-squared distribution of six degrees of freedom.
+MAX_SQUARED_LENGTH = 20.1
 
 
 @dataclass(frozen=True)
@@ -58,20 +61,29 @@ def change_attributes(found: Refinement | None, item: Registered, rest: Array) -
         camera, calibrated = item.views[name].camera, item.recording.views[name].camera
         moved, sigma = _pixel_change(change, camera, rest)
         own = calibrated.calibration_sigma((rest - pose.translation) @ pose.rotation)
-        if _touched(moved, sigma, own) and moved < found.unexplained[name]:
+        value = change.value[:CLOCK]
+        length = float(value @ np.linalg.solve(change.covariance[:CLOCK, :CLOCK], value))
+        if _touched(moved, own, length) and moved < found.unexplained[name]:
             raise InputError(
                 f"--refine-cameras: camera {name} would have its pixels moved by {moved:.2g} px, but the simulated "
                 f"motion is {found.unexplained[name]:.2g} px from the recorded one in any case: errors of the model "
                 "cannot be told from a turned camera; leave the option out, or check the specimen file"
             )
         sigmas = np.sqrt(np.diag(change.covariance))
-        result[PREFIX + name] = np.concatenate([change.value, sigmas, [moved, sigma, own, found.unexplained[name]]])
+        pixels = [moved, sigma, own, found.unexplained[name], length]
+        result[PREFIX + name] = np.concatenate([change.value, sigmas, pixels])
     return result
 
 
-def _touched(moved: float, sigma: float, calibration: float) -> bool:
-    """Whether a change of the pixels is more than its uncertainty and that of the calibration (NaN if not known)."""
-    return bool(moved > MAX_SIGMAS * np.hypot(sigma, np.nan_to_num(calibration)))
+def _touched(moved: float, calibration: float, squared_length: float) -> bool:
+    """Whether a change is more than its own uncertainty and that of the calibration.
+
+    Args:
+        moved: root mean square change of the pixels [px].
+        calibration: uncertainty of the pixels [px]; NaN if not known.
+        squared_length: of the change of the pose, in standard deviations.
+    """
+    return bool(squared_length > MAX_SQUARED_LENGTH and moved > MAX_SIGMAS * np.nan_to_num(calibration))
 
 
 def _pixel_change(change: CameraChange, camera: Camera, points: Array) -> tuple[float, float]:
@@ -90,7 +102,7 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
     rows = []
     for name, numbers in found.items():
         value, sigma, pixels = np.split(np.asarray(numbers, dtype=float), [CLOCK + 1, 2 * CLOCK + 2])
-        moved, moved_sigma, own, unexplained = pixels
+        moved, moved_sigma, own, unexplained, length = pixels
         frames = 1.0 / dataset.simulator.time_step
         known = "" if np.isnan(own) else f" (calibration +- {own:.2g})"
         rows.append(
@@ -100,7 +112,7 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
                 _pairs(1e3 * value[3:CLOCK], 1e3 * sigma[3:CLOCK]),
                 _pairs(frames * value[CLOCK:], frames * sigma[CLOCK:]),
                 f"{moved:.3g} +- {moved_sigma:.2g}{known}, {unexplained:.2g} unexplained",
-                _touched(moved, moved_sigma, own),
+                _touched(moved, own, length),
             )
         )
     return rows

@@ -31,6 +31,7 @@ Array = NDArray[Any]
 # smaller. The release is known to the nearest frame.
 TURN_SIGMA, SHIFT_SIGMA = np.radians(0.5), 1e-3  # [rad], [m]
 CLOCK_SIGMA, RELEASE_SIGMA = 0.5, 0.3  # [frames]
+SCALE_SIGMA = 1e-3  # of an image's scale: of a lens whose focus was touched, or of temperature
 REFERENCE_SIGMA = 1e-6  # of the first camera's clock, which the others' are told against [frames]
 LEAST_PLACE_SIGMA = 1e-7  # of a place that is exactly known [m]
 QUANTITIES = METHOD_QUANTITIES["sysid-loss"]
@@ -42,6 +43,9 @@ MATERIAL_STEP = 1e-4  # of a variable, for differences
 FIRST_FRAME_STEP = 1e-6  # root mean square motion of the nodes, for differences [m]
 TIME_STEP = 1e-2  # [frames]
 FARTHEST = 100.0  # prior standard deviations that a variable may deviate by
+# The squared differences count as if there were fewer of them by this factor, because a dot's error lasts while it
+# looks the same. In a rendered film, turns were wrong by 3 to 4 standard deviations of independent errors.
+LASTING = 10.0
 MAX_LIKENESS = 0.98  # correlation between frames; a larger one is that of few frames
 
 
@@ -68,9 +72,10 @@ def refine_cameras(
 
     Gauss-Newton minimises the squared differences of the simulated and the measured pixels, robust by Huber's loss, and
     the squared deviations from the priors. Its variables are E, nu and the loss factor, the poses and clocks of the
-    cameras, the first frame and the time of release of every recording, and the places of the markers. The squared
-    differences are relative to their mean, times (1 + r) / (1 - r) with their correlation r between frames: errors of
-    the model last, and tell less than their number.
+    cameras, the first frame and the time of release of every recording, the places of the markers, and the scales of
+    the images, without which a small difference in scale would be taken for a large tilt. The squared differences are
+    relative to their mean, times (1 + r) / (1 - r) with their correlation r between frames, and times `LASTING`: errors
+    last, and tell less than their number.
 
     Args:
         dataset: built with the cameras as calibrated.
@@ -111,8 +116,8 @@ def refine_cameras(
 class _Search:
     """The search for all variables, in units of the standard deviations of their priors.
 
-    They are those of the material, of every camera (7), of every recording (its release and D of its first frame), and
-    of the places (3 M).
+    They are those of the material, of every camera (7 and the scale of its image), of every recording (its release and
+    D of its first frame), and of the places (3 M).
     """
 
     def __init__(
@@ -139,11 +144,15 @@ class _Search:
         self.first_steps = FIRST_FRAME_STEP / moved
         first_sigma = np.concatenate([np.repeat(frames[0].linear_force_sigma(), 3), [MODULUS_SIGMA]])
         count, cameras, recordings = len(markers.names), len(self.cameras), len(chosen)
-        sizes = [len(QUANTITIES), *[7] * cameras, recordings, *[len(first_sigma)] * recordings, 3 * count]
+        sizes = [len(QUANTITIES), *[7] * cameras, cameras, recordings, *[len(first_sigma)] * recordings, 3 * count]
         ends = np.cumsum(sizes)
         parts = [slice(end - size, end) for end, size in zip(ends, sizes, strict=True)]
-        self.material, self.poses, self.releases = parts[0], parts[1 : 1 + cameras], parts[1 + cameras]
-        self.first_frames, self.places = parts[2 + cameras : -1], parts[-1]
+        self.material, self.poses, self.scales, self.releases = (
+            parts[0],
+            parts[1 : 1 + cameras],
+            *parts[-3 - recordings : -1 - recordings],
+        )
+        self.first_frames, self.places = parts[-1 - recordings : -1], parts[-1]
         one = np.array([TURN_SIGMA] * 3 + [SHIFT_SIGMA] * 3 + [CLOCK_SIGMA * self.step])
         poses = np.tile(one, (cameras, 1))
         poses[0, CLOCK] = REFERENCE_SIGMA * self.step
@@ -152,6 +161,7 @@ class _Search:
             [
                 [quantity.deviation for quantity in QUANTITIES],
                 poses.ravel(),
+                np.full(cameras, SCALE_SIGMA),
                 np.full(recordings, RELEASE_SIGMA * self.step),
                 np.tile(first_sigma, recordings),
                 np.repeat(places, 3),
@@ -216,8 +226,9 @@ class _Search:
             changes[name] = CameraChange(x[own] * scale, self.centre, scale[:, None] * covariance[own, own] * scale)
         markers, q = self._simulated(self.recordings, x[None])
         placed, unexplained = self._placed(markers[:, 0], self._place_gain(q), x), {}
-        for name, term in zip(self.cameras, self._terms(self.recordings, x), strict=True):
-            gaps = term.gap(placed)[term.seen > 0]
+        terms = self._terms(self.recordings, x)
+        for name, term, image_scale in zip(self.cameras, terms, self._scales(x), strict=True):
+            gaps = term.gap(self._scaled(placed, image_scale))[term.seen > 0]
             unexplained[name] = float(gaps.square().mean().sqrt())
         return Refinement(changes, unexplained)
 
@@ -268,13 +279,23 @@ class _Search:
         except SimulationError:
             return _Differences(np.inf, np.zeros((len(recordings.markers), 1)))
         placed = self._placed(markers[:, 0], self._place_gain(q), x)
-        return self._compared(recordings, self._terms(recordings, x), placed)
+        return self._compared(recordings, x, placed)
 
-    def _compared(self, recordings: Recordings, terms: list[CameraTerm], placed: Tensor) -> "_Differences":
+    def _scales(self, x: Array) -> list[float]:
+        """Scales of the cameras' images over those calibrated."""
+        return [float(value) for value in 1.0 + (x * self.scale)[self.scales]]
+
+    def _scaled(self, placed: Tensor, scale: float) -> Tensor:
+        """Markers (T, R, M, 3) [m] as a camera shows them whose image has another scale."""
+        centre = torch.from_numpy(self.centre)
+        return centre + scale * (placed - centre)
+
+    def _compared(self, recordings: Recordings, x: Array, placed: Tensor) -> "_Differences":
         """Differences of the pixels of markers (T, R, M, 3) [m]."""
+        terms = self._terms(recordings, x)
         limit, objective, weighted = recordings.limit[None, :, None], 0.0, []
-        for term in terms:
-            gap = (term.root @ term.gap(placed)[..., None])[..., 0]
+        for term, scale in zip(terms, self._scales(x), strict=True):
+            gap = (term.root @ term.gap(self._scaled(placed, scale))[..., None])[..., 0]
             square = gap.square().sum(-1)
             objective += float(torch.where(square > limit, 2.0 * (limit * square).sqrt() - limit, square).sum())
             weighted.append(gap * _huber_root(square, limit)[..., None])
@@ -293,9 +314,11 @@ class _Search:
         change = (simulated[:, 1:] - simulated[:, :1]) / steps[:, None, None, None]
         gain, limit, jacobians = self._place_gain(q), recordings.limit[None, :, None], []
         placed, terms = self._placed(simulated[:, 0], gain, x), self._terms(recordings, x)
-        for term, camera_change, own_pose in zip(terms, self._changes(x), self.poses, strict=True):
-            points = at_lags(placed, term.lag)
-            square = (term.root @ term.gap(placed)[..., None])[..., 0].square().sum(-1)
+        cameras = zip(terms, self._changes(x), self.poses, self._scales(x), strict=True)
+        for number, (term, camera_change, own_pose, scale) in enumerate(cameras):
+            scaled = self._scaled(placed, scale)
+            points = at_lags(scaled, term.lag)
+            square = (term.root @ term.gap(scaled)[..., None])[..., 0].square().sum(-1)
             root = _huber_root(square, limit)[..., None, None] * term.root
             slope = root @ term.slope(points)  # (T, R, M, 2, 3)
             jacobian = torch.zeros((*slope.shape[:-1], len(x)), dtype=torch.float64)
@@ -307,7 +330,10 @@ class _Search:
                     jacobian[:, r, :, :, own[k - material]] = by_start[:, r]
             by_pose = [camera_change.pose_slope(c, points[:, b].numpy()) for b, c in enumerate(term.cameras)]
             jacobian[..., own_pose.start : own_pose.start + CLOCK] = root @ torch.from_numpy(np.stack(by_pose, axis=1))
-            later, earlier = (at_lags(placed, term.lag + step) for step in (TIME_STEP, -TIME_STEP))
+            jacobian[..., self.scales.start + number] = (slope @ (points - torch.from_numpy(self.centre))[..., None])[
+                ..., 0
+            ]
+            later, earlier = (at_lags(scaled, term.lag + step) for step in (TIME_STEP, -TIME_STEP))
             velocity = (later - earlier) / (2.0 * TIME_STEP * self.step)
             by_time = -(slope @ velocity[..., None])[..., 0]
             by_time[0] = 0.0  # at rest
@@ -320,7 +346,7 @@ class _Search:
                 jacobian[:, :, m, :, place : place + 3] = by_place[:, :, m]
             jacobians.append(jacobian * torch.from_numpy(self.scale))
         derivatives = torch.cat(jacobians, dim=2).numpy().reshape(-1, len(x))
-        return self._compared(recordings, terms, placed), derivatives
+        return self._compared(recordings, x, placed), derivatives
 
 
 def _huber_root(square: Tensor, limit: Tensor) -> Tensor:
@@ -347,7 +373,7 @@ class _Differences:
         square, product = float((r[:-1] ** 2 * both).sum()), float((r[1:] * r[:-1]).sum())
         likeness = float(np.clip(product / square, 0.0, MAX_LIKENESS)) if square > 0.0 else 0.0
         freedom = max(int(np.count_nonzero(r)) - variables, 1)
-        return float((r**2).sum()) / freedom * (1.0 + likeness) / (1.0 - likeness)
+        return LASTING * float((r**2).sum()) / freedom * (1.0 + likeness) / (1.0 - likeness)
 
 
 def _at_rest(term: CameraTerm, name: str, chosen: list[Registered]) -> CameraTerm:

@@ -146,7 +146,9 @@ def test_errors_of_the_model_are_not_taken_for_a_turn(
     locking = replace(front, material=replace(front.material, integration="full"))
     with pytest.raises(InputError, match="expected elements that follow a bent body"):
         built(tmp_path, locking, True)
-    found = Refinement({"right": CameraChange(np.append(TURN, np.zeros(4)), np.zeros(3))}, {"right": 5.0})
+    found = Refinement(
+        {"right": CameraChange(np.append(TURN, np.zeros(4)), np.zeros(3), 1e-9 * np.eye(7))}, {"right": 5.0}
+    )
     monkeypatch.setattr("rafl.capture.dataset.build.refine_cameras", lambda *arguments: found)
     with pytest.raises(InputError, match=r"camera right would have its pixels moved by .* 5 px from the recorded one"):
         built(tmp_path, front, True)
