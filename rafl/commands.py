@@ -41,9 +41,8 @@ from rafl.fitting.distributed import OtherProcessError, rank
 from rafl.fitting.fit import fit as fit_model
 from rafl.fitting.methods import DEFAULT_EPOCHS
 from rafl.fitting.quantities import METHOD_QUANTITIES, POISSON
-from rafl.fitting.run_folder import FittedModel, load_model
+from rafl.fitting.run_folder import FittedModel, Report, load_model
 from rafl.fitting.sysid import parameter_sentences
-from rafl.fitting.train_field import Report
 from rafl.simulation.device import require_device
 
 LABELS = {"missing": "residual targets not met"}  # of columns of the history, where its name says too little

@@ -15,10 +15,10 @@ from rafl.data.objective import Recordings
 from rafl.data.strain_range import StrainRange
 from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.gauss_newton import GOOD, Minimum
-from rafl.fitting.material_search import History, MaterialSearch
-from rafl.fitting.run_folder import FittedModel, Settings, save_model
+from rafl.fitting.material_search import MaterialSearch
+from rafl.fitting.run_folder import FittedModel, History, Report, Settings, save_model
 from rafl.fitting.sysid import BRANCHES, add_constitutive_residual, branches_search
-from rafl.fitting.train_field import Report, prepare_datasets, recording_errors, training_items
+from rafl.fitting.train_field import prepare_datasets, recording_errors, training_items
 from rafl.simulation.rollout import rollout
 
 SELECTION_FILE = "selection.csv"

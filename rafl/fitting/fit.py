@@ -13,8 +13,16 @@ from rafl.data.dataset_file import read_dataset
 from rafl.data.objective import Objective
 from rafl.fitting.distributed import process_group
 from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs
-from rafl.fitting.run_folder import HISTORY_FILE, SETTINGS_FILE, FittedModel, Settings, read_settings, write_settings
-from rafl.fitting.train_field import Report, pretraining_unavailable, training_items
+from rafl.fitting.run_folder import (
+    HISTORY_FILE,
+    SETTINGS_FILE,
+    FittedModel,
+    Report,
+    Settings,
+    read_settings,
+    write_settings,
+)
+from rafl.fitting.train_field import pretraining_unavailable, training_items
 from rafl.fitting.warm_start import MAX_VERTICES
 from rafl.simulation.device import CPU, require_device
 

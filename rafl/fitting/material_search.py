@@ -1,6 +1,5 @@
 """The search for a material: the loss, its exact gradient and its Gauss-Newton matrix, minimised within bounds."""
 
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from rafl.common.arrays import ArrayFormat, check_shape, check_values
 from rafl.common.errors import SimulationError
 from rafl.data.dataset import Dataset
 from rafl.data.objective import Recordings, frame_errors, loss_curvature, recording_losses
-from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.gauss_newton import (
     EARLY,
     EXACT,
@@ -28,14 +26,13 @@ from rafl.fitting.quantities import FIXED_POISSONS_RATIO, POISSON, Quantity, mat
 from rafl.fitting.run_folder import (
     FORMAT,
     FittedModel,
+    History,
     Settings,
     expect_content,
     load_tensors,
     save_tensors,
-    write_history,
 )
 from rafl.fitting.train_field import (
-    Report,
     batches_by_dataset,
     mean_error,
     prepare_datasets,
@@ -62,30 +59,6 @@ DIFFERENCE_STEP = 1e-4  # of a variable, for the derivatives of the markers in t
 # The Gauss-Newton matrix is that of up to so many recordings, from the largest to the least motion, and of so many
 # simulations at most, as long as one recording remains.
 CURVATURE_RECORDINGS, CURVATURE_SIMULATIONS = 3, 24
-
-
-@dataclass
-class History:
-    """The rows of `history.csv` of a run, over all its searches.
-
-    Attributes:
-        run: folder of the run.
-        report: called with every row.
-        group: processes that search together.
-        rows: so far.
-    """
-
-    run: Path
-    report: Report
-    group: ProcessGroup = ALONE
-    rows: list[dict[str, float]] = field(default_factory=list)
-
-    def append(self, row: dict[str, float]) -> None:
-        """Append a row, write the file and report the row."""
-        self.rows.append({"epoch": len(self.rows), **row})
-        if self.group.is_main:
-            write_history(self.run, self.rows)
-        self.report(self.rows[-1])
 
 
 class MaterialSearch:

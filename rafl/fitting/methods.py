@@ -8,10 +8,10 @@ from rafl.data.dataset import Dataset
 from rafl.fitting.auto import fit_auto
 from rafl.fitting.distributed import ProcessGroup
 from rafl.fitting.quantities import METHOD_QUANTITIES
-from rafl.fitting.run_folder import FittedModel, Settings
+from rafl.fitting.run_folder import FittedModel, Report, Settings
 from rafl.fitting.supervised import fit_supervised, shared_vertex_count
 from rafl.fitting.sysid import fit_constitutive, identify_material
-from rafl.fitting.train_field import Report, fit_residual_field, load_start_model, training_items
+from rafl.fitting.train_field import fit_residual_field, load_start_model, training_items
 from rafl.simulation.time_integration import INTEGRATORS
 
 FitFunction = Callable[[list[Dataset], Settings, Path, Report, ProcessGroup], FittedModel]

@@ -4,7 +4,7 @@ import io
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from rafl.common.files import require_file, write_bytes, write_text
 from rafl.common.yaml_files import check_format, describe_validation, read_yaml_content
 from rafl.data.objective import Objective
 from rafl.fem.material import Material
+from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.residual.acceleration_field import ResidualField
 from rafl.residual.energy_limit import LimitedForce
 from rafl.residual.global_residual import GlobalResidual
@@ -33,6 +34,8 @@ MAX_EXPANSION = 3  # of a file of tensors when it is unpacked; torch does not pa
 TIME_INTEGRATION_KEY = "stepping"  # in model.pt
 ENERGY_KEY, SEEN_KEY = "energy_fraction", "seen"
 
+
+Report = Callable[[dict[str, float]], None]  # called with every row of the history
 
 # A residual model of a user's own: makes the residual force on the mesh of a simulator.
 ResidualModel = Callable[[Simulator], ResidualForce]
@@ -278,3 +281,27 @@ def has_stalled(errors: Sequence[float], patience: int) -> bool:
 def write_history(run: Path, rows: list[dict[str, float]]) -> None:
     """Write `history.csv`, one row per epoch."""
     write_text(run / HISTORY_FILE, pd.DataFrame(rows).to_csv(index=False))
+
+
+@dataclass
+class History:
+    """The rows of `history.csv` of a run, over all its searches.
+
+    Attributes:
+        run: folder of the run.
+        report: called with every row.
+        group: processes that search together.
+        rows: so far.
+    """
+
+    run: Path
+    report: Report
+    group: ProcessGroup = ALONE
+    rows: list[dict[str, float]] = field(default_factory=list)
+
+    def append(self, row: dict[str, float]) -> None:
+        """Append a row, write the file and report the row."""
+        self.rows.append({"epoch": len(self.rows), **row})
+        if self.group.is_main:
+            write_history(self.run, self.rows)
+        self.report(self.rows[-1])

@@ -10,8 +10,8 @@ from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.residual_targets import compute_targets, read_targets
-from rafl.fitting.run_folder import FittedModel, Settings, has_stalled, load_model, save_model, write_history
-from rafl.fitting.train_field import Report, mean_error, prepare_datasets, training_items, validation_batches
+from rafl.fitting.run_folder import FittedModel, Report, Settings, has_stalled, load_model, save_model, write_history
+from rafl.fitting.train_field import mean_error, prepare_datasets, training_items, validation_batches
 from rafl.residual.global_residual import GlobalResidual, network_input
 
 BATCH_STATES = 256  # states per update

@@ -10,10 +10,9 @@ from rafl.common.files import write_text
 from rafl.data.dataset import Dataset
 from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.gauss_newton import Array, Minimum, Prior
-from rafl.fitting.material_search import History, MaterialSearch
+from rafl.fitting.material_search import MaterialSearch
 from rafl.fitting.quantities import LOSS_FACTOR, METHOD_QUANTITIES, Quantity, material_values
-from rafl.fitting.run_folder import FittedModel, Settings, save_model
-from rafl.fitting.train_field import Report
+from rafl.fitting.run_folder import FittedModel, History, Report, Settings, save_model
 
 MIN_REPORTED_CORRELATION = 0.9
 BRANCHES = "sysid-branches"

@@ -1,7 +1,6 @@
 """End-to-end training of the residual acceleration field through the simulator (paper, RAFL objective)."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ from rafl.fitting.distributed import ALONE, ProcessGroup
 from rafl.fitting.run_folder import (
     FORMAT,
     FittedModel,
+    Report,
     Settings,
     expect_content,
     has_stalled,
@@ -37,8 +37,6 @@ from rafl.simulation.rollout import rollout
 MAX_GRADIENT_NORM = 10.0
 FINAL_RATE_FRACTION = 0.02  # last learning rate as a fraction of the first
 CHECKPOINT_FILE = "checkpoint.pt"
-
-Report = Callable[[dict[str, float]], None]
 
 
 def limit_frames(dataset: Dataset, frames: int) -> Dataset:

@@ -14,9 +14,9 @@ from rafl.data.strain_range import StrainRange
 from rafl.data.synthetic import loaded_equilibria, release_dataset
 from rafl.fem.material import Material
 from rafl.fitting.auto import SELECTION_FILE, Candidate, choose, fit_auto, selection_sentences
-from rafl.fitting.material_search import History, MaterialSearch
+from rafl.fitting.material_search import MaterialSearch
 from rafl.fitting.quantities import METHOD_QUANTITIES
-from rafl.fitting.run_folder import FittedModel, Settings, load_model
+from rafl.fitting.run_folder import FittedModel, History, Settings, load_model
 from rafl.fitting.train_field import mean_error
 
 SETTINGS = Settings("auto", ("small.h5",), 12, 1e-3, 0.0, 10, 0, 5)
