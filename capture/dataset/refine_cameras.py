@@ -38,7 +38,7 @@ QUANTITIES = METHOD_QUANTITIES["sysid-loss"]
 RECORDINGS = 2  # of the largest and the least motion; more hardly tell more
 FRAME_SHARES = 0.4, 1.0  # a search over many oscillations starts near its end
 LINEARISATIONS, STEPS, HALVINGS = 10, 4, 5
-SETTLED = 0.1  # a step of fewer standard deviations ends the search
+SETTLED = 1e-4  # the search ends with a step that promises a smaller decrease of the objective, relative to it
 MATERIAL_STEP = 1e-4  # of a variable, for differences
 FIRST_FRAME_STEP = 1e-6  # root mean square motion of the nodes, for differences [m]
 TIME_STEP = 1e-2  # [frames]
@@ -198,10 +198,9 @@ class _Search:
                 normal = jacobian.T @ jacobian / variance + np.eye(len(x))
                 gradient = jacobian.T @ found.weighted.ravel() / variance + x - self.mean
                 step = bounded_step(normal, gradient, self.low - x, self.high - x)
-                covariance = np.linalg.inv(normal)
-                if self._settled(step, covariance):
-                    break
                 least = found.objective / variance + float(((x - self.mean) ** 2).sum())
+                if -(2.0 * gradient + normal @ step) @ step < SETTLED * least:
+                    break
                 for _ in range(HALVINGS):
                     trial = self._differences(recordings, x + step)
                     own = trial.objective / variance + float(((x + step - self.mean) ** 2).sum())
@@ -211,12 +210,9 @@ class _Search:
                 else:
                     break
                 x, found = x + step, trial
-            if self._settled(x - begin, covariance):
+            if x is begin:
                 break
-        return x, covariance
-
-    def _settled(self, step: Array, covariance: Array) -> bool:
-        return bool(np.abs(step / np.sqrt(np.diag(covariance))).max() < SETTLED)
+        return x, np.linalg.inv(normal)
 
     def refinement(self, x: Array, covariance: Array) -> Refinement:
         """The changes of the cameras at variables x."""
