@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rafl.capture.dataset.camera_summary import change_attributes
 from rafl.capture.dataset.modulus import estimate_modulus
 from rafl.capture.dataset.naming import in_layout_order
-from rafl.capture.dataset.refine_cameras import refine_cameras
+from rafl.capture.dataset.refine_cameras import refine_cameras, require_following_elements
 from rafl.capture.dataset.registered import Registered, find_dataset_places
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.sources import find_sources, read_recording
@@ -65,6 +65,8 @@ def build_dataset(
         InputError: a file, marker or frame does not fit; the message names it.
         SimulationError: a first frame cannot be fitted.
     """
+    if settings.refine_cameras:
+        require_following_elements(specimen)
     markers = specimen.markers(settings.tolerance)
     if known is not None:
         _check_same_layout(markers, known)

@@ -62,6 +62,16 @@ class Refinement:
     unexplained: dict[str, float]
 
 
+def require_following_elements(specimen: Specimen) -> None:
+    """Raise InputError if the elements lock: their errors would be taken for turned cameras."""
+    if specimen.material.integration != "enhanced":
+        raise InputError(
+            "--refine-cameras: expected elements that follow a bent body, found integration: "
+            f"{specimen.material.integration}, whose errors would be taken for turned cameras; use preset: physical in "
+            "the specimen file, or leave the option out"
+        )
+
+
 def refine_cameras(
     dataset: Dataset,
     specimen: Specimen,
@@ -84,16 +94,9 @@ def refine_cameras(
         whole_surface: whether virtual forces act on the whole surface.
 
     Raises:
-        InputError: no training recording in a known frame has pixels and starts at rest, the elements lock, or the
-            clamp moves.
+        InputError: no training recording in a known frame has pixels and starts at rest, or the clamp moves.
         SimulationError: a simulation failed.
     """
-    if specimen.material.integration != "enhanced":
-        raise InputError(
-            "--refine-cameras: expected elements that follow a bent body, found integration: "
-            f"{specimen.material.integration}, whose errors would be taken for turned cameras; use preset: physical in "
-            "the specimen file, or leave the option out"
-        )
     if any(view.rotation is not None for item in registered for view in item.views.values()):
         raise InputError("--refine-cameras: expected a clamp at rest, found one that moves; leave the option out")
     usable = [item for item in registered if item.row.split == "train" and item.views and not item.start.moving]
