@@ -32,6 +32,7 @@ class CameraRow:
         pixels: root mean square change of the markers' pixels at rest, the calibration's own uncertainty of them, and
             what the model leaves unexplained.
         touched: whether the change is more than the calibration's uncertainty.
+        doubt: why the camera's or the body's model is in doubt; empty if what it leaves unexplained is as expected.
     """
 
     camera: str
@@ -40,6 +41,7 @@ class CameraRow:
     clock: str
     pixels: str
     touched: bool
+    doubt: str
 
 
 def change_attributes(found: Refinement | None, item: Registered, rest: Array) -> dict[str, Array]:
@@ -70,7 +72,10 @@ def change_attributes(found: Refinement | None, item: Registered, rest: Array) -
                 "cannot be told from a turned camera; leave the option out, or check the specimen file"
             )
         sigmas = np.sqrt(np.diag(change.covariance))
-        pixels = [moved, sigma, own, found.unexplained[name], length]
+        variances = np.diagonal(item.views[name].covariance, axis1=-2, axis2=-1)
+        expected = float(np.sqrt(np.nanmean(variances)))
+        scale = float(np.linalg.det((slope := camera.jacobian(change.centre)) @ slope.T) ** 0.25)
+        pixels = [moved, sigma, own, found.unexplained[name], length, expected, scale]
         result[PREFIX + name] = np.concatenate([change.value, sigmas, pixels])
     return result
 
@@ -102,7 +107,9 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
     rows = []
     for name, numbers in found.items():
         value, sigma, pixels = np.split(np.asarray(numbers, dtype=float), [CLOCK + 1, 2 * CLOCK + 2])
-        moved, moved_sigma, own, unexplained, length = pixels
+        moved, moved_sigma, own, unexplained, length, expected, scale = pixels
+        in_body = f"{unexplained:.2g} px ({1e3 * unexplained / scale:.2g} mm)"
+        doubt = f"{in_body} where the dots are known to {expected:.2g} px"
         frames = 1.0 / dataset.simulator.time_step
         known = "" if np.isnan(own) else f" (calibration +- {own:.2g})"
         rows.append(
@@ -113,6 +120,7 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
                 _pairs(frames * value[CLOCK:], frames * sigma[CLOCK:]),
                 f"{moved:.3g} +- {moved_sigma:.2g}{known}, {unexplained:.2g} unexplained",
                 _touched(moved, own, length),
+                doubt if unexplained > MAX_SIGMAS * expected else "",
             )
         )
     return rows
@@ -123,11 +131,19 @@ def _pairs(values: Array, sigmas: Array) -> str:
 
 
 def camera_warnings(dataset: Dataset) -> list[str]:
-    """A line for every camera whose change is more than its calibration's uncertainty."""
-    return [
+    """A line for every camera that was touched, and for every one that the model does not explain."""
+    rows = camera_rows(dataset)
+    doubts = [
+        f"camera {row.camera}: the simulated motion is {row.doubt} from the recorded one, whatever the material and "
+        "the camera's pose; the camera shows perspective that its calibration leaves out, or the body is not as the "
+        "model has it"
+        for row in rows
+        if row.doubt
+    ]
+    return doubts + [
         f"camera {row.camera}: the markers' pixels are {row.pixels} px from where its calibration has them; it was "
         "touched since, or the body is not as the model has it. The dataset has the camera where it was found; "
         "calibrate again before the next recording"
-        for row in camera_rows(dataset)
+        for row in rows
         if row.touched
     ]

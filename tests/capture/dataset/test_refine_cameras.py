@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from filmed_markers import side_camera
+from filmed_markers import PIXELS_PER_METRE, side_camera
 from scipy.interpolate import CubicSpline
 
 from rafl.calibration.rig import Rig, rig_text
@@ -137,6 +137,17 @@ def test_changes_are_reported_and_kept(datasets: tuple[Dataset, Dataset], tmp_pa
     assert line.startswith("camera right: ")
     assert "calibrate again" in line
     assert camera_rows(datasets[0]) == []
+
+
+def test_motion_that_no_model_explains_is_named(datasets: tuple[Dataset, Dataset]) -> None:
+    swing = datasets[1].trajectories["swing"]
+    numbers = np.array(swing.attributes["camera_change_left"], dtype=float)
+    numbers[17] = 1.5  # px that remain
+    worse = replace(swing, attributes=swing.attributes | {"camera_change_left": numbers})
+    lines = camera_warnings(replace(datasets[1], trajectories={"swing": worse}))
+    (line,) = (line for line in lines if line.startswith("camera left: "))
+    assert f"1.5 px ({1.5e3 / PIXELS_PER_METRE:.2g} mm)" in line
+    assert "perspective" in line
 
 
 def test_errors_of_the_model_are_not_taken_for_a_turn(
