@@ -76,7 +76,7 @@ def fit_together(count: int, folder: Path, *options: object) -> subprocess.Compl
     [
         ("sysid", 3, {"epochs": 2}, SAME),  # the third process has no recording
         pytest.param("constitutive", 2, {"epochs": 2}, SAME, marks=pytest.mark.slow),
-        ("auto", 2, {"epochs": 1}, SAME),
+        pytest.param("auto", 2, {"epochs": 1}, SAME, marks=pytest.mark.slow),
         ("srl", 2, {"epochs": 2}, SAME),
         ("rafl", 2, {"epochs": 1, "batch": 2, "warm-start": 1}, 1e-5),  # gradients in single precision
     ],
