@@ -141,9 +141,9 @@ def camera_warnings(dataset: Dataset) -> list[str]:
         if row.doubt
     ]
     return doubts + [
-        f"camera {row.camera}: the markers' pixels are {row.pixels} px from where its calibration has them; it was "
-        "touched since, or the body is not as the model has it. The dataset has the camera where it was found; "
-        "calibrate again before the next recording"
+        f"camera {row.camera}: found turned by {row.turn} degrees about x, y and z since its calibration, and shifted "
+        f"by {row.shift} mm; it was touched, or the body is not as the model has it. The dataset has the camera where "
+        "it was found; calibrate again before the next recording"
         for row in rows
         if row.touched
     ]
