@@ -22,6 +22,7 @@ from rafl.data.dataset import Dataset, Trajectory
 from rafl.data.objective import CameraTerm, Recordings
 from rafl.data.views import at_lags
 from rafl.fitting.gauss_newton import bounded_step
+from rafl.fitting.material_search import spread_by_size
 from rafl.fitting.quantities import METHOD_QUANTITIES, MODULUS, material_values
 from rafl.simulation.rollout import rollout
 
@@ -37,7 +38,7 @@ LEAST_PLACE_SIGMA = 1e-7  # of a place that is exactly known [m]
 QUANTITIES = METHOD_QUANTITIES["sysid-loss"]
 RECORDINGS = 2  # of the largest and the least motion; more hardly tell more
 FRAME_SHARES = 0.4, 1.0  # a search over many oscillations starts near its end
-LINEARISATIONS, STEPS, HALVINGS = 10, 4, 5
+LINEARISATIONS, STEPS, HALVINGS = 10, 4, 5  # at most; steps of one linearisation, and halvings of one step
 SETTLED = 1e-4  # the search ends with a step that promises a smaller decrease of the objective, relative to it
 MATERIAL_STEP = 1e-4  # of a variable, for differences
 FIRST_FRAME_STEP = 1e-6  # root mean square motion of the nodes, for differences [m]
@@ -107,8 +108,7 @@ def refine_cameras(
             "pixels of its cameras, found none; leave the option out"
         )
     motion = Recordings.of(dataset, [item.row.recording for item in usable]).square_motion
-    ranks = np.round(np.linspace(len(usable) - 1, 0, min(RECORDINGS, len(usable)))).astype(int)
-    chosen = [usable[k] for k in np.argsort(motion)[ranks]]
+    chosen = [usable[k] for k in spread_by_size(motion, RECORDINGS)]
     search = _Search(dataset, specimen, chosen, whole_surface)
     x = search.begin
     for share in FRAME_SHARES:
@@ -262,9 +262,7 @@ class _Search:
 
     def _place_gain(self, q: Tensor) -> Tensor:
         """Derivatives of the markers by their places at rest, (T, R, M, 3, 3)."""
-        markers, rest = self.dataset.markers, torch.from_numpy(self.dataset.simulator.mesh.vertices)
-        gain: Tensor = markers.axes(q) @ torch.linalg.inv(markers.axes(rest))
-        return gain
+        return self.dataset.markers.place_slope(q, torch.from_numpy(self.dataset.simulator.mesh.vertices))
 
     def _placed(self, markers: Tensor, gain: Tensor, x: Array) -> Tensor:
         """Markers (T, R, M, 3) [m] at their changed places."""

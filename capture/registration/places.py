@@ -128,8 +128,8 @@ def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, posed: bool) ->
     rows = np.flatnonzero(np.repeat(frame.measured, 3))
     whole = np.zeros((3 * len(frame.target), 7 + 3 * len(frame.target)))
     q = torch.from_numpy(fit.q)
-    gain = frame.markers.axes(q) @ torch.linalg.inv(frame.markers.axes(torch.from_numpy(frame.simulator.mesh.vertices)))
-    for m, own in enumerate(gain.numpy()):
+    by_place = frame.markers.place_slope(q, torch.from_numpy(frame.simulator.mesh.vertices))
+    for m, own in enumerate(by_place.numpy()):
         whole[3 * m : 3 * m + 3, 7 + 3 * m : 10 + 3 * m] = own
     if posed:
         whole[:, 1:7] = -pose_jacobian(frame.target).reshape(-1, 6)

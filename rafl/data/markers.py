@@ -63,6 +63,14 @@ class Markers:
         normal = torch.linalg.cross(a, b)
         return torch.stack([a, b, normal / torch.linalg.norm(normal, dim=-1, keepdim=True)], dim=-1)
 
+    def place_slope(self, q: Tensor, rest: Tensor) -> Tensor:
+        """Derivatives of the positions at q (..., N, 3) by the places on the body at rest (N, 3), (..., M, 3, 3).
+
+        A marker moves along with the material axes at its place.
+        """
+        slope: Tensor = self.axes(q) @ torch.linalg.inv(self.axes(rest))
+        return slope
+
     def _from_corners(self, corners: Tensor) -> Tensor:
         """Positions (..., M, 3) from the quads' corners (..., M, 4, 3)."""
         along, across = torch.from_numpy(self._tangent_weights)

@@ -233,7 +233,7 @@ class MaterialSearch:
         simulations of the batch.
         """
         motion = recordings.square_motion
-        chosen = _spread_by_size(motion, count)
+        chosen = spread_by_size(motion, count)
         few = recordings.select(chosen)
         sets = x + DIFFERENCE_STEP * np.vstack([np.zeros(len(x)), np.eye(len(x))])
         batch = len(few.names)
@@ -367,7 +367,7 @@ class MaterialSearch:
         return self.group.by_recording(self.training, 1, compute)[:, 0]
 
 
-def _spread_by_size(sizes: Array, count: int) -> list[int]:
+def spread_by_size(sizes: Array, count: int) -> list[int]:
     """Indices of `count` values at even ranks, the largest included, and the smallest too if there are two or more."""
     order = np.argsort(sizes)
     ranks = np.round(np.linspace(len(order) - 1, 0, min(count, len(order)))).astype(int)

@@ -132,7 +132,6 @@ def test_changes_are_reported_and_kept(datasets: tuple[Dataset, Dataset], tmp_pa
     rows = {row.camera: row for row in camera_rows(read_dataset(tmp_path / "beam.h5"))}
     assert rows["right"].touched
     assert not rows["left"].touched
-    assert rows["right"].clock.startswith("+0.29")
     (line,) = camera_warnings(datasets[1])
     assert line.startswith("camera right: ")
     assert "calibrate again" in line
