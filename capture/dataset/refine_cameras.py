@@ -14,8 +14,8 @@ from torch import Tensor
 
 from rafl.capture.dataset.registered import Registered
 from rafl.capture.registration.camera_change import CLOCK, CameraChange
-from rafl.capture.registration.first_frame import FirstFrame, linear_modes
-from rafl.capture.registration.initial import MODULUS_SIGMA
+from rafl.capture.registration.first_frame import FirstFrame
+from rafl.capture.registration.force_search import MODULUS_SIGMA
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError, SimulationError
 from rafl.data.dataset import Dataset, Trajectory
@@ -145,7 +145,7 @@ class _Search:
         self.start = np.stack([_start_directions(frame, dataset.trajectories[frame.recording]) for frame in frames])
         moved = np.sqrt((self.start**2).sum(-1).mean(axis=(0, 2)))  # [m] per unit of a direction, (D)
         self.first_steps = FIRST_FRAME_STEP / moved
-        first_sigma = np.concatenate([np.repeat(frames[0].linear_force_sigma(), 3), [MODULUS_SIGMA]])
+        first_sigma = np.concatenate([frames[0].resultant_modes()[1], [MODULUS_SIGMA]])
         count, cameras, recordings = len(markers.names), len(self.cameras), len(chosen)
         sizes = [len(QUANTITIES), *[7] * cameras, cameras, recordings, *[len(first_sigma)] * recordings, 3 * count]
         ends = np.cumsum(sizes)
@@ -389,8 +389,8 @@ def _at_rest(term: CameraTerm, name: str, chosen: list[Registered]) -> CameraTer
 
 
 def _start_directions(frame: FirstFrame, item: Trajectory) -> Array:
-    """Derivatives of a first frame's node positions, (D, N, 3): by forces linear over their nodes [N], and by log E."""
-    modes = np.kron(linear_modes(frame.simulator.mesh.vertices[frame.nodes]), np.eye(3))
+    """Derivatives of a first frame's node positions, (D, N, 3): by a force and a moment, and by log E."""
+    modes, _ = frame.resultant_modes()
     loads = np.zeros((*item.q.shape, modes.shape[1] + 1))
     loads[frame.nodes, :, :-1] = modes.reshape(len(frame.nodes), 3, -1)
     loads[..., -1] = -(frame.simulator.weight + item.virtual_force)

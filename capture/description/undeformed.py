@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from rafl.capture.description.naming import dots_by_row, faces_of
 from rafl.capture.description.still import Dots
-from rafl.capture.registration.initial import MODULUS_SIGMA
+from rafl.capture.registration.force_search import MODULUS_SIGMA
 from rafl.capture.registration.places import (
     MAX_ITERATIONS,
     MAX_MODULUS_STEP,

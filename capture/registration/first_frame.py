@@ -11,10 +11,11 @@ from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-LINEAR_FORCE_SIGMA = 1.0  # prior sigma of the part that varies linearly over the nodes, a force and a moment [N]
+RESULTANT_SIGMA = 1.0  # of the amplitudes of the modes of a force and a moment on the nodes [N]
 # Of the force of a known load, as a share of its weight: a string within three degrees of the vertical.
 LOAD_SIGMA = 0.05
 HANGING_SIGMA = 3e-3  # distance of the place where the load hangs from the middle of its nodes [m]
+LEAST_ARM = 1e-3  # of nodes about an axis, relative to the largest; with less, they are in line with it
 UNOBSERVED_SIGMA_FACTOR = 10.0  # a larger multiple of the median sigma marks an axis that no camera observed
 
 
@@ -57,18 +58,19 @@ class FirstFrame:
         weight = self.load * np.asarray(self.simulator.gravity)
         return np.tile(weight / len(self.nodes), len(self.nodes))
 
-    def linear_force_sigma(self) -> Array:
-        """Prior standard deviations of the amplitudes of `linear_modes` [N], (up to 4).
+    def resultant_modes(self) -> tuple[Array, Array]:
+        """Nodal forces that make up a force and a moment: F / L + a x (x - middle) at a node x.
 
-        A force F that acts at a distance d from the middle of nodes at x has the amplitude F d / sqrt(sum x^2).
+        Returns:
+            Orthonormal modes, (3 L, up to 6), and prior standard deviations of their amplitudes [N], (up to 6). Nodes
+            in a line take no moment about it.
         """
-        positions = self.simulator.mesh.vertices[self.nodes]
-        count = linear_modes(positions).shape[1]
+        modes, size = rigid_modes(self.simulator.mesh.vertices[self.nodes])
         if self.load == 0.0:
-            return np.full(count, LINEAR_FORCE_SIGMA)
+            return modes, np.full(modes.shape[1], RESULTANT_SIGMA)
         weight = self.load * float(np.linalg.norm(self.simulator.gravity))
-        arms = np.linalg.svd(positions - positions.mean(0), compute_uv=False)[: count - 1]
-        return weight * np.concatenate([[LOAD_SIGMA / np.sqrt(len(positions))], HANGING_SIGMA / arms])
+        force = np.full(3, weight * LOAD_SIGMA / np.sqrt(len(self.nodes)))
+        return modes, np.concatenate([force, weight * HANGING_SIGMA / size[3:]])
 
     @property
     def measured(self) -> NDArray[np.bool_]:
@@ -82,9 +84,19 @@ class FirstFrame:
         return np.asarray(sigma < UNOBSERVED_SIGMA_FACTOR * np.median(sigma[np.isfinite(sigma)]))
 
 
-def linear_modes(positions: Array) -> Array:
-    """Orthonormal values at `positions` (L, 3) of functions that are linear in the position, (L, up to 4)."""
-    extent = np.ptp(positions, axis=0).max()
-    functions = np.column_stack([np.ones(len(positions)), (positions - positions.mean(0)) / extent])
-    u, s, _ = np.linalg.svd(functions, full_matrices=False)
-    return np.asarray(u[:, s > 1e-9 * s[0]])
+def rigid_modes(positions: Array) -> tuple[Array, Array]:
+    """Orthonormal motions of points (L, 3) [m] that do not deform them: along x, y, z, and about their principal axes.
+
+    Returns:
+        Modes, (3 L, up to 6), and their sizes: square roots of the number of points, for a turn of the sum of their
+        squared distances from the axis [m]. Points in a line do not move by a turn about it.
+    """
+    arms = positions - positions.mean(axis=0)
+    shifts = np.tile(np.eye(3), (len(arms), 1))
+    axes = np.linalg.svd(arms)[2]
+    turns = np.stack([np.cross(axis, arms).ravel() for axis in axes], axis=1)
+    size = np.linalg.norm(turns, axis=0)
+    kept = size > LEAST_ARM * max(float(size.max()), np.finfo(float).tiny)
+    modes = np.concatenate([shifts, turns[:, kept]], axis=1)
+    sizes = np.concatenate([np.full(3, np.sqrt(len(arms))), size[kept]])
+    return modes / sizes, sizes

@@ -8,13 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import FirstFrame
-from rafl.capture.registration.initial import (
-    MODULUS_SIGMA,
-    LinearFit,
-    fit_linear_forces,
-    linear_jacobian,
-    modulus_slope,
-)
+from rafl.capture.registration.force_search import MODULUS_SIGMA, modulus_slope
+from rafl.capture.registration.initial import ResultantFit, fit_resultant, resultant_jacobian
 from rafl.capture.registration.rigid import RigidTransform, pose_jacobian
 from rafl.data.markers import Markers, embed
 
@@ -54,7 +49,7 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
 
     A marker's place is the same in all recordings, and so is the frame of the recordings whose frame is unknown, while
     forces differ. Gauss-Newton minimises over log E, the pose and the places, and for every recording the virtual
-    forces that vary linearly over their nodes:
+    force and moment:
 
         sum |x - target|^2 / (sigma^2 + R model_sigma^2) + sum |moved|^2 / prior_sigma^2 + the forces' prior + E's prior
 
@@ -74,7 +69,7 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
     layout, simulator = frames[0].markers, frames[0].simulator
     count, log_modulus, markers = len(layout.names), 0.0, layout
     moved = np.zeros((count, 3))
-    fits: list[LinearFit | None] = [None] * len(frames)
+    fits: list[ResultantFit | None] = [None] * len(frames)
     longest = float(np.ptp(layout.rest, axis=0).max())
     model_sigma = [MODEL_FRACTION * longest] * len(frames)  # until the deflections are known
     by_place = np.repeat(np.maximum(prior_sigma, MIN_PRIOR_SIGMA) ** -2.0, 3)
@@ -90,7 +85,7 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
             current = replace(frame, simulator=softened, markers=markers)
             if unknown[k]:
                 current = replace(current, target=pose.apply(frame.target))
-            fit = fit_linear_forces(current, model_sigma[k], fits[k])
+            fit = fit_resultant(current, model_sigma[k], fits[k])
             fits[k] = fit
             own_hessian, own_gradient = _reduced_normal_equations(current, fit, unknown[k])
             hessian += own_hessian
@@ -122,9 +117,9 @@ def _inverse(hessian: Array) -> Array:
     return np.asarray(scale[:, None] * np.linalg.inv(scale[:, None] * hessian * scale) * scale)
 
 
-def _reduced_normal_equations(frame: FirstFrame, fit: LinearFit, posed: bool) -> tuple[Array, Array]:
+def _reduced_normal_equations(frame: FirstFrame, fit: ResultantFit, posed: bool) -> tuple[Array, Array]:
     """Half the Hessian and half the gradient of one recording's part by (log E, pose, places), less its forces."""
-    local, residual = linear_jacobian(frame, fit)
+    local, residual = resultant_jacobian(frame, fit)
     rows = np.flatnonzero(np.repeat(frame.measured, 3))
     whole = np.zeros((3 * len(frame.target), 7 + 3 * len(frame.target)))
     q = torch.from_numpy(fit.q)

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -65,18 +67,40 @@ def test_accuracy_under_noise_of_five_micrometres(local: float) -> None:
     assert np.linalg.norm(found.q - truth, axis=1).max() < (5e-5 if local == 0.0 else 5e-4)
 
 
+def test_a_tip_held_by_a_hand_is_found_from_one_side(front: Specimen) -> None:
+    """The tip is turned by 50 degrees and held as it is; one camera with 0.02 px sees the dots of one face.
+
+    Linear forces alone would leave the tip 1 mm off.
+    """
+    simulator, markers, random = front.simulator(0.01), front.markers(1e-6), np.random.default_rng(2)
+    held = replace(simulator, fixed=np.union1d(simulator.fixed, front.loaded))
+    start = twisted_shapes(front.mesh, np.array([np.radians(50.0)]))
+    weight, zero = simulator.weight[None], np.zeros((1, len(front.mesh.vertices)))
+    truth = held.minimise(start.copy(), zero, start, weight, held.constitutive_state(1), "held")[0]
+    target = markers.positions(torch.from_numpy(truth)).numpy()
+    sigma = np.tile([2.2e-6, np.inf, 2.2e-6], (len(target), 1))
+    target = target + random.normal(0.0, 2.2e-6, target.shape)
+    target[:, 1] = 0.0  # in a plane that is assumed
+    axes = np.tile(np.eye(3), (len(target), 1, 1))
+    found = fit_first_frame(FirstFrame(simulator, markers, front.loaded, target, sigma, "test", axes=axes))
+    assert np.linalg.norm(found.q - truth, axis=1).max() < 1.5e-4
+
+
 def test_surface_forces_fit_shapes_that_tip_forces_cannot() -> None:
-    """A twist along the whole canonical beam."""
+    """The canonical beam pushed to both sides, at its middle and at its tip."""
     specimen = read_specimen(CANONICAL)
     simulator, markers = specimen.simulator(0.01), specimen.markers(1e-6)
-    truth = twisted_shapes(simulator.mesh, np.array([1.0]))[0]
+    vertices, force = simulator.mesh.vertices, simulator.weight.copy()
+    force[np.isclose(vertices[:, 0], 0.05), 1] += 0.1
+    force[specimen.loaded, 1] -= 0.04
+    truth = simulator.equilibrium(force[None])[0]
     target = markers.positions(torch.from_numpy(truth)).numpy()
     sigma = np.full_like(target, 2e-5)
     surface = np.setdiff1d(np.unique(simulator.mesh.surface), simulator.fixed)
     tip_fit = fit_first_frame(FirstFrame(simulator, markers, specimen.loaded, target, sigma, "test"))
     surface_fit = fit_first_frame(FirstFrame(simulator, markers, surface, target, sigma, "test", whole_surface=True))
     surface_error, tip_error = (np.linalg.norm(found.q - truth, axis=1).max() for found in (surface_fit, tip_fit))
-    assert surface_error < 1.5e-3
+    assert surface_error < 5e-4
     assert surface_error < 0.6 * tip_error
     assert surface_fit.residual < 0.5 * tip_fit.residual
 

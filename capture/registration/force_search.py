@@ -1,0 +1,280 @@
+"""The search for the virtual forces of a first frame, under one prior of how the body is loaded."""
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from rafl.capture.registration.first_frame import FirstFrame, rigid_modes
+from rafl.capture.registration.rigid import RigidTransform, kabsch, pose_jacobian
+from rafl.common.errors import SimulationError
+
+Array = NDArray[Any]
+
+MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
+INITIAL_DAMPING = 1e4  # of a Levenberg-Marquardt step, as a multiple of the prior
+MAX_ITERATIONS, MAX_TRIALS = 100, 6  # of one search, and of one step; the sixth is damped 2^15 times as much
+# The search ends where an undamped step promises a smaller decrease: relative to the objective, plus absolute.
+RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-3
+
+
+@dataclass(frozen=True)
+class ForcePrior:
+    """How a body may be loaded in its first frame.
+
+    Attributes:
+        local_sigma: standard deviation of what a nodal force has beyond its part of a force and a moment on all nodes
+            [N].
+        shape_sigma: standard deviation of the loaded nodes from a rigid motion of them all [m]; infinite if they may
+            deform.
+    """
+
+    local_sigma: float
+    shape_sigma: float = np.inf
+
+    def precision(self, frame: FirstFrame) -> Array:
+        """Inverse prior covariance of the forces on the frame's nodes [1/N^2], (3 L, 3 L)."""
+        modes, sigma = frame.resultant_modes()
+        resultant = (modes * sigma**-2.0) @ modes.T
+        precision: Array = resultant + (np.eye(len(modes)) - modes @ modes.T) / self.local_sigma**2
+        return precision
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """A loaded body.
+
+    Attributes:
+        frame: observation, with a simulator of the modulus that is tried.
+        log_modulus: logarithm of that modulus over the assumed one.
+        force: virtual nodal forces [N], (N, 3).
+        pose: from the frame of the target to the specimen frame.
+        q: node positions in equilibrium [m], (N, 3).
+        residual: markers of the mesh minus measured markers along their axes [m], (3 M').
+        shape: of the loaded nodes, less their rigid motion, over `ForcePrior.shape_sigma`, (3 L).
+        objective: that is minimised.
+    """
+
+    frame: FirstFrame
+    log_modulus: float
+    force: Array
+    pose: RigidTransform
+    q: Array
+    residual: Array
+    shape: Array
+    objective: float
+
+
+class ForceSearch:
+    """One minimisation, by the Levenberg-Marquardt method.
+
+    Args:
+        frame: observation.
+        prior: of the forces.
+        model_sigma: of the difference between mesh and specimen [m].
+        with_pose: whether the pose is fitted too.
+        with_modulus: whether Young's modulus is fitted too, around the assumed one.
+    """
+
+    def __init__(
+        self, frame: FirstFrame, prior: ForcePrior, model_sigma: float, with_pose: bool, with_modulus: bool
+    ) -> None:
+        self.frame, self.prior, self.with_pose, self.with_modulus = frame, prior, with_pose, with_modulus
+        self.model_sigma = model_sigma
+        self.precision = prior.precision(frame)
+        self.expected = frame.expected_force()
+        self._measured_sigma = float(np.sqrt((frame.sigma[frame.measured][frame.observed_axes] ** 2).mean()))
+        self.weight = 1.0 / np.sqrt(frame.sigma[frame.measured].ravel() ** 2 + model_sigma**2)
+
+    def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float) -> Estimate:
+        """Equilibrium, residual and objective, with the solve started at `start` (N, 3) if given."""
+        frame = _softened(self.frame, log_modulus)
+        simulator = frame.simulator
+        total, label = (simulator.weight + force)[None], f"{frame.recording}: first frame"
+        if start is None:
+            q = simulator.equilibrium(total, label=label)[0]
+        else:  # `minimise` fails at once where `equilibrium` would increase the load in small steps
+            zero = np.zeros(total.shape[:2])
+            q = simulator.minimise(start[None], zero, start[None], total, simulator.constitutive_state(1), label)[0]
+        positions = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.measured]
+        residual = frame.along_axes(positions - pose.apply(frame.target[frame.measured])).ravel()
+        shape = self._shape(q)
+        f = force[frame.nodes].ravel() - self.expected
+        by_prior = f @ self.precision @ f + shape @ shape + (log_modulus / MODULUS_SIGMA) ** 2
+        objective = float(((self.weight * residual) ** 2).sum() + by_prior)
+        return Estimate(frame, log_modulus, force, pose, q, residual, shape, objective)
+
+    def minimise(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float = 0.0) -> Estimate:
+        """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and modulus."""
+        current = self.evaluate(force, pose, start, log_modulus)
+        damping, growth = INITIAL_DAMPING, 2.0  # updated as by H. B. Nielsen
+        for _ in range(MAX_ITERATIONS):
+            gradient, hessian = self._normal_equations(current)
+            promised = gradient @ np.linalg.solve(hessian, gradient)
+            if promised < RELATIVE_TOLERANCE * current.objective + ABSOLUTE_TOLERANCE:
+                break
+            damping_matrix = self._damping_matrix(hessian)
+            for _ in range(MAX_TRIALS):
+                step = np.linalg.solve(hessian + damping * damping_matrix, -gradient)
+                try:
+                    trial = self._take_step(current, step)
+                except SimulationError:  # the step was too long; more damping shortens it
+                    decrease = -np.inf
+                else:
+                    decrease = current.objective - trial.objective
+                if decrease > 0.0:
+                    predicted = -float(step @ (2.0 * gradient + hessian @ step))
+                    damping, growth = damping * max(1.0 / 3.0, 1.0 - (2.0 * decrease / predicted - 1.0) ** 3), 2.0
+                    break
+                damping, growth = damping * growth, 2.0 * growth
+            if decrease <= 0.0:
+                break
+            current = trial
+        return current
+
+    def with_prior(self, prior: ForcePrior, model_sigma: float) -> "ForceSearch":
+        """The search for the same unknowns under another prior, with another error of the model [m]."""
+        return ForceSearch(self.frame, prior, model_sigma, self.with_pose, self.with_modulus)
+
+    def rms(self, found: Estimate) -> float:
+        """Root mean square of the residuals along observed axes [m]."""
+        return float(np.sqrt((found.residual.reshape(-1, 3)[self.frame.observed_axes] ** 2).mean()))
+
+    @property
+    def observation_sigma(self) -> float:
+        """Root mean square standard deviation along observed axes, of measurement and model [m]."""
+        return float(np.hypot(self._measured_sigma, self.model_sigma))
+
+    def model_error(self, found: Estimate) -> float:
+        """What the residuals exceed the measurement's standard deviation by, in squares [m]."""
+        return float(np.sqrt(max(self.rms(found) ** 2 - self._measured_sigma**2, 0.0)))
+
+    def residual_sigmas(self, found: Estimate) -> float:
+        """Root mean square residual over the measurement's standard deviation."""
+        return self.rms(found) / self._measured_sigma
+
+    def log_evidence(self, found: Estimate) -> float:
+        """Logarithm of the probability of the observation under the prior, up to a constant.
+
+        By Laplace's approximation at the minimum. Fits with other priors and model errors of the same unknowns are
+        compared by it.
+        """
+        _, hessian = self._normal_equations(found)
+        by_shape = self._shape_slopes(found) if np.isfinite(self.prior.shape_sigma) else np.zeros((0, len(hessian)))
+        known = slice(0, len(self.precision))
+        prior = self.precision + by_shape[:, known].T @ by_shape[:, known]
+        weight = self.weight[self.weight > 0.0]
+        spread = np.linalg.slogdet(prior)[1] - np.linalg.slogdet(hessian)[1]
+        return float(np.log(weight).sum() + 0.5 * (spread - found.objective))
+
+    def marker_sigma(self, found: Estimate) -> Array:
+        """Largest standard deviations of the measured markers [m], (M'), in a fit without a pose.
+
+        By Laplace's approximation: the covariance of forces and log E is the inverse of the Gauss-Newton Hessian.
+        """
+        slopes = self._marker_slopes(found)
+        by_unknowns = slopes.reshape(-1, 3, slopes.shape[1])
+        solved = np.linalg.solve(self._normal_equations(found)[1], slopes.T).T.reshape(by_unknowns.shape)
+        sigma: Array = np.sqrt(np.linalg.eigvalsh(by_unknowns @ solved.swapaxes(1, 2))[:, -1])
+        return sigma
+
+    def _normal_equations(self, current: Estimate) -> tuple[Array, Array]:
+        """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, the pose (6) or log E."""
+        jacobian = self._marker_slopes(current)
+        if self.with_pose:
+            posed = current.pose.apply(self.frame.target[self.frame.measured])
+            jacobian = np.concatenate([jacobian, -pose_jacobian(posed).reshape(-1, 6)], axis=1)
+        jacobian *= self.weight[:, None]
+        gradient, hessian = jacobian.T @ (self.weight * current.residual), jacobian.T @ jacobian
+        count = len(self.precision)
+        gradient[:count] += self.precision @ (current.force[self.frame.nodes].ravel() - self.expected)
+        hessian[:count, :count] += self.precision
+        if self.with_modulus:
+            gradient[-1] += current.log_modulus / MODULUS_SIGMA**2
+            hessian[-1, -1] += MODULUS_SIGMA**-2.0
+        if np.isfinite(self.prior.shape_sigma):
+            slopes = self._shape_slopes(current)
+            own = np.r_[:count, count + 6 * self.with_pose : len(gradient)]  # the pose does not deform the body
+            gradient[own] += slopes.T @ current.shape
+            hessian[np.ix_(own, own)] += slopes.T @ slopes
+        return gradient, hessian
+
+    def _marker_slopes(self, current: Estimate) -> Array:
+        """Derivatives of the measured markers, along their axes, by forces and, if fitted, log E, (3 M', 3 L [+ 1])."""
+        slopes = marker_jacobian(current.frame, current.q)
+        if self.with_modulus:
+            by_modulus = self.frame.along_axes(modulus_slope(current.frame, current.q, current.force))
+            slopes = np.concatenate([slopes, by_modulus.reshape(-1, 1)], axis=1)
+        return slopes
+
+    def _shape(self, q: Array) -> Array:
+        """`Estimate.shape` of node positions (N, 3)."""
+        nodes = self.frame.nodes
+        if not np.isfinite(self.prior.shape_sigma):
+            return np.zeros(3 * len(nodes))
+        undeformed = self.frame.simulator.mesh.vertices[nodes]
+        rigid = kabsch(undeformed, q[nodes])
+        return np.asarray((q[nodes] - rigid.apply(undeformed)).ravel() / self.prior.shape_sigma)
+
+    def _shape_slopes(self, current: Estimate) -> Array:
+        """Derivatives of `Estimate.shape` by forces and, if fitted, log E, (3 L, 3 L [+ 1]); small strains assumed."""
+        nodes, simulator, size = self.frame.nodes, current.frame.simulator, 3 * len(self.frame.nodes)
+        loads = np.zeros((*current.q.shape, size + self.with_modulus))
+        loads[nodes, :, :size] = np.eye(size).reshape(len(nodes), 3, size)
+        if self.with_modulus:
+            loads[..., -1] = -(simulator.weight + current.force)
+        slopes = simulator.solve_tangent(current.q[None], loads[None])[0][nodes].reshape(size, -1)
+        rigid, _ = rigid_modes(current.q[nodes])
+        return np.asarray((slopes - rigid @ (rigid.T @ slopes)) / self.prior.shape_sigma)
+
+    def _damping_matrix(self, hessian: Array) -> Array:
+        """The prior of the forces; for the pose, which has no prior, a small multiple of its Hessian diagonal."""
+        matrix, count = np.diag(1e-6 * np.diag(hessian)), len(self.precision)
+        matrix[:count, :count] = self.precision
+        if self.with_modulus:
+            matrix[-1, -1] = MODULUS_SIGMA**-2.0
+        return matrix
+
+    def _take_step(self, current: Estimate, step: Array) -> Estimate:
+        force, count = current.force.copy(), len(self.precision)
+        force[self.frame.nodes] += step[:count].reshape(-1, 3)
+        pose = current.pose.followed_by(step[count : count + 6]) if self.with_pose else current.pose
+        log_modulus = current.log_modulus + float(step[-1]) if self.with_modulus else current.log_modulus
+        return self.evaluate(force, pose, current.q, log_modulus)
+
+
+def _softened(frame: FirstFrame, log_modulus: float) -> FirstFrame:
+    """The frame with another Young's modulus, by the logarithm of its ratio to the assumed one."""
+    if log_modulus == 0.0:
+        return frame
+    material = frame.simulator.material
+    modulus = material.youngs_modulus * float(np.exp(log_modulus))
+    return replace(frame, simulator=replace(frame.simulator, material=replace(material, youngs_modulus=modulus)))
+
+
+def modulus_slope(frame: FirstFrame, q: Array, force: Array) -> Array:
+    """Derivatives of the measured markers by log E at an equilibrium q (N, 3) under forces (N, 3) [m], (M', 3).
+
+    The internal forces are proportional to E, and in equilibrium equal to the weight and the virtual forces.
+    """
+    by_modulus = -frame.simulator.solve_tangent(q[None], (frame.simulator.weight + force)[None])[0]
+    corners = frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()
+    slope: Array = np.einsum("micj,mcj->mi", corners, by_modulus[frame.markers.quad])[frame.measured]
+    return slope
+
+
+def marker_jacobian(frame: FirstFrame, q: Array) -> Array:
+    """Derivatives of the measured markers, along their axes, by the forces on the nodes [m/N], (3 M', 3 L).
+
+    q: equilibrium [m], (N, 3).
+    """
+    measured = np.flatnonzero(frame.measured)
+    by_corner = frame.along_axes(frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()[measured])  # (M', 3, 4, 3)
+    rows = np.zeros((len(measured), 3, *q.shape))
+    for corner in range(4):
+        rows[np.arange(len(measured)), :, frame.markers.quad[measured, corner]] += by_corner[:, :, corner]
+    solved = frame.simulator.solve_tangent(q[None], np.moveaxis(rows.reshape(-1, *q.shape), 0, -1)[None])[0]
+    jacobian: Array = np.moveaxis(solved[frame.nodes], -1, 0).reshape(3 * len(measured), -1)
+    return jacobian
