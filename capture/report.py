@@ -31,10 +31,10 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}
 <p class="note">Registration: largest distance of a marker from its layout position after the transform to the specimen
 frame. First frame fit: root mean square distance between the markers of the fitted mesh and the recorded ones. Sigma:
 largest standard deviation of a marker of the fitted mesh in any direction; across the line of sight of one camera it is
-small, along it only the specimen's shape tells the position.</p>
+small, along it only the specimen's shape tells the position. Loaded by: what the shape of the first frame shows.</p>
 <table><tr><th>recording</th><th>split</th><th>load [g]</th><th>frames</th><th>valid</th><th>first frame</th>
-<th>found from</th><th>state</th><th>frames averaged</th><th>registered by</th><th>registration [mm]</th>
-<th>first frame fit [mm]</th><th>sigma [mm]</th></tr>
+<th>found from</th><th>state</th><th>loaded by</th><th>frames averaged</th><th>registered by</th>
+<th>registration [mm]</th><th>first frame fit [mm]</th><th>sigma [mm]</th></tr>
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 {% if cameras %}<h2>Cameras</h2>
 <p class="note">How each camera was found to have moved since its calibration, and how late its clock is: turned about
@@ -119,6 +119,7 @@ def _row(name: str, dataset: Dataset) -> list[object]:
         values["first_frame"],
         values["first_frame_from"],
         "moving" if values["initial"] == "moving" else "at rest",
+        values.get("loading", "-"),
         values["still_frames"],
         values["registration"],
         _measured(float(str(values["registration_residual_mm"])), ".3f"),

@@ -202,6 +202,7 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
             "not_free_frames": start.not_free,
             "initial": settings.initial if settings.initial == "sequence" else "moving" if start.moving else "rest",
             "forces": settings.forces,
+            "loading": initial.loading,
             "fit_residual_mm": 1e3 * initial.residual,
             "fit_markers_mm": 1e3 * np.linalg.norm(residual, axis=1),
             "fit_sigma_mm": 1e3 * (np.full(len(frame.target), np.nan) if start.moving else initial.marker_sigma),

@@ -25,12 +25,14 @@ class ForcePrior:
     """How a body may be loaded in its first frame.
 
     Attributes:
+        name: of what loads it.
         local_sigma: standard deviation of what a nodal force has beyond its part of a force and a moment on all nodes
             [N].
         shape_sigma: standard deviation of the loaded nodes from a rigid motion of them all [m]; infinite if they may
             deform.
     """
 
+    name: str
     local_sigma: float
     shape_sigma: float = np.inf
 

@@ -19,14 +19,14 @@ Array = NDArray[Any]
 
 # A load hangs from the free end, and practically only its force and moment act; or a hand holds the end, so that it
 # hardly deforms, under any forces; or forces are local, and dent the mesh.
-HUNG, HELD = ForcePrior(1e-5), ForcePrior(10.0, shape_sigma=1e-5)
-LOCAL = ForcePrior(5e-3), ForcePrior(5e-2), ForcePrior(0.5)
-SURFACE_PRIOR = ForcePrior(0.3)  # if forces act on the whole surface
+HUNG, HELD = ForcePrior("a hanging load", 1e-5), ForcePrior("a held end", 10.0, shape_sigma=1e-5)
+LOCAL = tuple(ForcePrior("local forces", sigma) for sigma in (5e-3, 5e-2, 0.5))
+SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act on the whole surface
 REFITS = 5  # at most, with the model's error that the last fit left
 SETTLED = 1.2  # ratio of standard deviations of the observation in successive fits; a smaller one ends the refits
 HANGING_ODDS = 3.0  # logarithm of how much likelier a hanging load is beforehand than forces of another kind
 EXPLAINED = 1.2  # root mean square residual over sigma of a fit that leaves nothing for other forces to explain
-LOCAL_FORCE_SIGMA = 5e-3  # of the local part of a nodal force that changes while the body moves [N]
+FORCE_CHANGE = LOCAL[0]  # while the body moves
 FORCE_CHANGE_RATE = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
 
 
@@ -41,6 +41,7 @@ class InitialState:
         pose: from the frame of the target to the specimen frame; the identity if it was not fitted.
         marker_sigma: largest standard deviation of each marker's position in any direction [m], (M); NaN where the
             marker was not measured, and in fits without Young's modulus.
+        loading: what loads the body, in words.
     """
 
     q: Array
@@ -48,6 +49,7 @@ class InitialState:
     residual: float
     pose: RigidTransform
     marker_sigma: Array
+    loading: str
 
 
 def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> InitialState:
@@ -85,7 +87,7 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     weight = frame.simulator.weight
     # With the assumed modulus, the same shape needs forces that are larger by the ratio of the moduli.
     force = np.exp(-best.log_modulus) * (weight + best.force) - weight
-    return InitialState(best.q, force, np.sqrt(3.0) * search.rms(best), best.pose, marker_sigma)
+    return InitialState(best.q, force, np.sqrt(3.0) * search.rms(best), best.pose, marker_sigma, search.prior.name)
 
 
 def _choose(first: ForceSearch, found: Estimate) -> tuple[ForceSearch, Estimate]:
@@ -182,7 +184,7 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
     known = np.isfinite(sigma)
     weight = 1.0 / sigma[known]
     weighted = weight[:, None] * jacobian[known]
-    own = SURFACE_PRIOR if frame.whole_surface else ForcePrior(LOCAL_FORCE_SIGMA)
+    own = SURFACE_PRIOR if frame.whole_surface else FORCE_CHANGE
     prior = own.precision(frame) / FORCE_CHANGE_RATE**2
     gradient = weighted.T @ (weight * velocity[known])
     force_rate = np.zeros_like(q)

@@ -58,4 +58,4 @@ def fit_by_sequence(frame: FirstFrame, iterations: int = ITERATIONS) -> InitialS
     final = frame.along_axes((frame.markers.positions(found[0])[measured] - target).numpy())[frame.observed_axes]
     rms_distance = float(np.sqrt((final**2).mean() * 3.0))
     unknown = np.full(len(frame.target), np.nan)
-    return InitialState(found[0].numpy(), found[1].numpy(), rms_distance, IDENTITY, unknown)
+    return InitialState(found[0].numpy(), found[1].numpy(), rms_distance, IDENTITY, unknown, "a sequence of forces")
