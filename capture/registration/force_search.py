@@ -87,8 +87,10 @@ class ForceSearch:
         self.model_sigma = model_sigma
         self.precision = prior.precision(frame)
         self.expected = frame.expected_force()
-        self._measured_sigma = float(np.sqrt((frame.sigma[frame.measured][frame.observed_axes] ** 2).mean()))
-        self.weight = 1.0 / np.sqrt(frame.sigma[frame.measured].ravel() ** 2 + model_sigma**2)
+        sigma, observed = frame.sigma[frame.measured], frame.observed_axes
+        self._measured_sigma = float(np.sqrt((sigma[observed] ** 2).mean()))
+        # A depth that no camera observed is an assumption, and the same one for all markers.
+        self.weight = np.where(observed, 1.0 / np.hypot(sigma, model_sigma), 0.0).ravel()
 
     def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float) -> Estimate:
         """Equilibrium, residual and objective, with the solve started at `start` (N, 3) if given."""

@@ -40,7 +40,7 @@ class InitialState:
         residual: root mean square marker distance over the observed axes [m].
         pose: from the frame of the target to the specimen frame; the identity if it was not fitted.
         marker_sigma: largest standard deviation of each marker's position in any direction [m], (M); NaN where the
-            marker was not measured, and in fits without Young's modulus.
+            marker was not measured, and in fits with a pose.
         loading: what loads the body, in words.
     """
 
@@ -77,8 +77,8 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
         best = search.minimise(zero, pose or IDENTITY, None)
     else:
         # The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose
-        # would: the two can hardly be told apart. So would positions in a plane that is assumed, not measured.
-        with_modulus = not with_pose and (frame.axes is not None or bool(frame.observed_axes.all()))
+        # would: the two can hardly be told apart.
+        with_modulus = not with_pose
         first = ForceSearch(frame, HUNG, 0.0, with_pose, with_modulus)
         hung = first.minimise(zero, pose or IDENTITY, None)
         search, best = _choose(first, hung)
