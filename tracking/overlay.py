@@ -30,8 +30,9 @@ def display_pixels(tracks: Tracks, name: str, camera: Camera) -> Array:
 
     These are the measured pixels; a filled marker is drawn at the projection of its 3-D position.
     """
+    measured, _ = tracks.in_frames(name)
     projected = np.where((tracks.state == FILLED)[..., None], camera.project(tracks.position), np.nan)
-    return np.where(np.isfinite(tracks.pixel[name]), tracks.pixel[name], projected)
+    return np.where(np.isfinite(measured), measured, projected)
 
 
 def annotate(grey: Array, pixel: Array, filled: NDArray[np.bool_], names: tuple[str, ...], trails: Array) -> Array:

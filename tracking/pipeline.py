@@ -20,7 +20,13 @@ from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.linking.naming import name_by_layout, name_by_rows
 from rafl.tracking.reconstruction.gap_filling import MEASURED, fill_gaps
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, resample_pixels, shown_frames, triangulate
+from rafl.tracking.reconstruction.triangulation import (
+    CameraPixels,
+    coincide,
+    resample_pixels,
+    shown_frames,
+    triangulate,
+)
 from rafl.tracking.video.reader import Video
 from rafl.tracking.video.timestamps import (
     camera_times,
@@ -64,7 +70,10 @@ class TrackingSettings:
 
 
 def existing_tracks(path: Path, videos: dict[str, Video], rig: Rig, settings: TrackingSettings) -> Tracks | None:
-    """Read the tracks at `path`; None unless they are complete and made from these videos, cameras and settings."""
+    """Read the tracks at `path`; None unless they are complete and made from these videos, cameras and settings.
+
+    Tracks of an earlier program that lack what a camera filmed between the rows are not complete.
+    """
     if not path.is_file():
         return None
     try:
@@ -72,7 +81,8 @@ def existing_tracks(path: Path, videos: dict[str, Video], rig: Rig, settings: Tr
     except InputError:
         return None
     same = tracks.calibration == rig_text(rig) and tracks.settings == settings.text() and tracks.version == VERSION
-    return tracks if same and tracks.sources == _sources(videos) else None
+    complete = not any(tracks.lacks_filmed(camera) for camera in tracks.pixel)
+    return tracks if same and complete and tracks.sources == _sources(videos) else None
 
 
 def _sources(videos: dict[str, Video]) -> dict[str, str]:
@@ -115,6 +125,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     clock = common_clock(rig_times)
     frame = {camera: shown_frames(time, clock) for camera, time in rig_times.items()}
     pixels = {camera: resample_pixels(item, rig_times[camera], clock) for camera, item in in_order.items()}
+    apart = [camera for camera, time in rig_times.items() if not coincide(time, clock)]
     position, sigma, residual = triangulate(rig, pixels)
     notes += [note for camera in in_order for note in _perspective_note(rig, camera, position)]
     position, sigma, state = fill_gaps(position, sigma, clock, settings.fill)
@@ -155,6 +166,9 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         notes=tuple(notes),
         videos={camera: str(video.path.absolute()) for camera, video in videos.items()},
         lag={camera: np.where(shown < 0, 0.0, rig_times[camera][shown] - clock) for camera, shown in frame.items()},
+        filmed_time={camera: rig_times[camera] - clock[0] for camera in apart},
+        filmed_pixel={camera: in_order[camera].pixel for camera in apart},
+        filmed_sigma={camera: in_order[camera].sigma for camera in apart},
         longest_gap=settings.fill,
     )
 

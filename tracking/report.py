@@ -100,7 +100,7 @@ def _camera_section(tracks: Tracks, name: str, rig: Rig) -> dict[str, object]:
     pixel = display_pixels(tracks, name, rig.cameras[name])
     images = tracks.images[name]
     first = min(images)
-    sigma = tracks.pixel_sigma[name]
+    _, sigma = tracks.in_frames(name)
     row_of = tracks.rows_by_frame(name)
     shown = int(np.isfinite(sigma[..., 0]).any(axis=0).sum())
     largest = np.nan_to_num(sigma).max(axis=(1, 2), initial=0.0)

@@ -39,6 +39,7 @@ Array = NDArray[Any]
 
 VELOCITY_WINDOW_FRAMES = 5  # the polynomial through all of them gives the velocity in the first frame
 SAME_PLACE = 1e-9  # [m]
+SAME_INSTANT = 1e-3  # difference of times that is their rounding in files [frames]
 
 
 def build_dataset(
@@ -276,10 +277,12 @@ class _EvenGrid:
     Attributes:
         time: [s], (T).
         slot: index along T of every recorded frame, (F).
+        late: time of every recorded frame minus that of its row [s], (F).
     """
 
     time: Array
     slot: NDArray[np.int64]
+    late: Array
 
     @classmethod
     def of(cls, time: Array, step: float, first: int, row: RecordingRow) -> "_EvenGrid":
@@ -291,7 +294,9 @@ class _EvenGrid:
                 f"recording {row.recording}: expected even frame times, found frame {frame} too early; track it again "
                 "with the true rate (--fps)"
             )
-        return cls(step * np.arange(slot[-1] + 1), slot)
+        late = time - time[0] - step * slot
+        late = np.where(np.abs(late) < SAME_INSTANT * step, 0.0, late)
+        return cls(step * np.arange(slot[-1] + 1), slot, late)
 
     def fill(self, values: Array, missing: float) -> Array:
         """Values (F, ..) at the even times, (T, ..); dropped frames become gaps."""
@@ -306,7 +311,7 @@ class _EvenGrid:
             view.camera,
             self.fill(view.pixel, np.nan),
             self.fill(view.covariance, np.nan),
-            self.fill(view.lag, 0.0),
+            self.fill(view.lag + self.late, 0.0),
             None if view.rotation is None else view.rotation[recorded],
             None if view.translation is None else view.translation[recorded],
         )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
-from rafl.capture.registration.camera_change import CameraChange, positions_at
+from rafl.capture.registration.camera_change import CameraChange, positions_at, without_lag
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.motion_start import MotionStart, find_motion_start
 from rafl.capture.registration.places import Places, find_places
@@ -71,7 +71,7 @@ class Registered:
             [k if name not in registration.outliers else -1 for k, name in enumerate(specimen.layout.names)]
         )
         views = {camera: view.select_markers(kept) for camera, view in recording.views.items()}
-        views = _in_frame(views, registration.pose)
+        views = _in_frame(views, registration.pose, recording.time)
         return cls(recording, row, registration, position, sigma, start, last, views)
 
     def with_changes(self, changes: dict[str, CameraChange]) -> "Registered":
@@ -95,7 +95,7 @@ class Registered:
         position = places.pose.apply(self.position)
         by_pose = pose_sigma(places.pose_covariance, position)
         sigma = np.hypot(places.pose.rotate_sigma(self.sigma), by_pose)
-        views = _in_frame(self.views, places.pose)
+        views = _in_frame(self.views, places.pose, self.recording.time)
         return replace(self, registration=registration, position=position, sigma=sigma, views=views)
 
     def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
@@ -104,9 +104,8 @@ class Registered:
         target, sigma = average_frames(self.position[rest], self.sigma[rest])
         name, axes = self.row.recording, None
         if self.views:
-            target, axes, sigma = average_views(
-                {key: view.select_frames(rest) for key, view in self.views.items()}, target
-            )
+            views = self.views if self.start.rest_start < self.start.frame else self._views_without_lag()
+            target, axes, sigma = average_views({key: view.select_frames(rest) for key, view in views.items()}, target)
         if np.isfinite(target[:, 0]).sum() < MIN_MARKERS:
             raise InputError(
                 f"recording {name}, frame {self.start.frame}: expected at least {MIN_MARKERS} markers, found fewer; "
@@ -116,15 +115,26 @@ class Registered:
         nodes = surface if whole_surface else specimen.loaded
         return FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface, axes=axes)
 
+    def _views_without_lag(self) -> dict[str, View]:
+        """What the cameras would have measured at the times of the frames: a specimen that moves has moved on since."""
+        views = {name: without_lag(view, self.recording.time) for name, view in self.views.items()}
+        moving = self.registration.pose.rotation.ndim > 2
+        return _in_frame(views, self.registration.pose, self.recording.time) if moving else views
 
-def _in_frame(views: dict[str, View], pose: RigidTransform) -> dict[str, View]:
-    """The views in the specimen frame, to which a pose leads from the cameras' frame, one or one for every frame."""
+
+def _in_frame(views: dict[str, View], pose: RigidTransform, time: Array) -> dict[str, View]:
+    """The views in the specimen frame, to which a pose leads from the cameras' frame: one, or one for every frame.
+
+    time: of the frames [s], (T).
+    """
     if pose is IDENTITY:
         return views
     if pose.rotation.ndim > 2:
-        return {
-            name: replace(view, rotation=pose.rotation, translation=pose.translation) for name, view in views.items()
-        }
+        result = {}
+        for name, view in views.items():
+            own = pose.at_times(time, time + view.lag) if view.lag.any() else pose
+            result[name] = replace(view, rotation=own.rotation, translation=own.translation)
+        return result
     return {
         name: replace(view, camera=view.camera.in_frame(pose.rotation, pose.translation))
         for name, view in views.items()

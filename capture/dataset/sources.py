@@ -19,9 +19,9 @@ from rafl.common.units import METRES
 from rafl.data.views import View
 from rafl.tracking.reconstruction.corrected_tracks import CorrectedTracks, read_corrected_tracks
 from rafl.tracking.reconstruction.corrections import corrections_path
-from rafl.tracking.reconstruction.gap_filling import MEASURED, MISSING
+from rafl.tracking.reconstruction.filmed_markers import FilmedMarkers
+from rafl.tracking.reconstruction.gap_filling import MISSING
 from rafl.tracking.reconstruction.tracks import Tracks
-from rafl.tracking.reconstruction.triangulation import outlier_limit
 
 Array = NDArray[Any]
 
@@ -141,7 +141,7 @@ def _read(path: Path, fps: float, unit: str | None) -> Recording:
 
 
 def _read_views(tracks: Tracks, path: Path) -> dict[str, View]:
-    """What the cameras of tracks measured: the pixels that agree with the 3-D positions.
+    """What the cameras of tracks measured in their frames: the pixels that agree with the 3-D positions.
 
     The covariance contains what an orthographic camera leaves out of the perspective.
     """
@@ -150,18 +150,13 @@ def _read_views(tracks: Tracks, path: Path) -> dict[str, View]:
     rig, views = parse_calibration(tracks.calibration, path), {}
     if lacking := set(tracks.pixel) - set(rig.cameras):
         raise InputError(f"{path}: expected the calibration of camera {min(lacking)}, found none; track again")
-    measured = tracks.state == MEASURED
-    seen = {name: measured & np.isfinite(tracks.pixel_sigma[name]).all(axis=2) for name in tracks.pixel}
-    alone = np.sum(list(seen.values()), axis=0) == 1
-    for name, pixel in tracks.pixel.items():
-        camera, sigma = rig.cameras[name], tracks.pixel_sigma[name]
+    for name in tracks.pixel:
+        camera, filmed = rig.cameras[name], FilmedMarkers.of(tracks, rig, name)
         by_plane = 0.0 if camera.plane is None else camera.plane.sigma
         with np.errstate(invalid="ignore"):
-            kept = seen[name] & (tracks.residual[name] <= outlier_limit(sigma, camera))
-            error = camera.model_error(tracks.position, np.where(alone, by_plane, 0.0))
-        variance = np.where(kept[..., None], sigma**2 + error**2, np.nan)
-        covariance = variance[..., None] * np.eye(2)
-        views[name] = View(camera, np.where(kept[..., None], pixel, np.nan), covariance, np.zeros(len(pixel)))
+            error = camera.model_error(filmed.position, np.where(filmed.alone, by_plane, 0.0))
+        variance = np.where(np.isfinite(filmed.sigma), filmed.sigma**2 + error**2, np.nan)
+        views[name] = View(camera, filmed.pixel, variance[..., None] * np.eye(2), filmed.lag)
     return views
 
 

@@ -67,11 +67,23 @@ def positions_at(views: Mapping[str, View], time: Array) -> tuple[Array, Array]:
 
     time: of the frames [s], (T).
     """
-    pixels = {}
-    for name, view in views.items():
-        own = time + view.lag
-        sigma = np.sqrt(np.diagonal(view.covariance, axis1=-2, axis2=-1))
-        pixels[name] = resample_pixels(CameraPixels(view.pixel, sigma), own, np.clip(time, own[0], own[-1]))
+    pixels = {name: _at_row_times(view, time, clip=True) for name, view in views.items()}
     rig = Rig({name: view.camera for name, view in views.items()})
     position, sigma, _ = triangulate_some(rig, pixels)
     return position, sigma
+
+
+def without_lag(view: View, time: Array) -> View:
+    """A view with its pixels interpolated to the times of the frames [s], (T); NaN where it filmed none around."""
+    if not view.lag.any():
+        return view
+    found = _at_row_times(view, time, clip=False)
+    covariance = (found.sigma**2)[..., None] * np.eye(2)
+    return replace(view, pixel=found.pixel, covariance=covariance, lag=np.zeros_like(view.lag))
+
+
+def _at_row_times(view: View, time: Array, clip: bool) -> CameraPixels:
+    """Pixels interpolated to the times of the frames (T); with `clip`, at the ends those of the first and last time."""
+    own = time + view.lag
+    sigma = np.sqrt(np.diagonal(view.covariance, axis1=-2, axis2=-1))
+    return resample_pixels(CameraPixels(view.pixel, sigma), own, np.clip(time, own[0], own[-1]) if clip else time)

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation, RotationSpline, Slerp
 
 Array = NDArray[Any]
 
@@ -45,6 +46,11 @@ class RigidTransform:
         if self.rotation.ndim != 3:
             return self
         return RigidTransform(self.rotation[chosen], self.translation[chosen])
+
+    def at_times(self, time: Array, requested: Array) -> "RigidTransform":
+        """Of transforms at times (T) [s] those at other times (S), by cubic splines."""
+        rotation = RotationSpline(time, Rotation.from_matrix(self.rotation))(requested).as_matrix()
+        return RigidTransform(rotation, CubicSpline(time, self.translation)(requested))
 
     def rotate_sigma(self, sigma: Array) -> Array:
         """Sigmas (..., M, 3) along the rotated axes; correlations between axes are ignored."""

@@ -21,7 +21,8 @@ SPLITS = ("train", "val", "test")
 THROUGH_MODEL = "through the model"  # begins the description of a registration that rests on the assumed material
 # Largest relative error of frame times against an even time grid, and of one recording's time step against another's.
 MAX_RELATIVE_TIME_ERROR = 5e-3
-MAX_LAG = 1.0  # of a camera's measurement to its row [frames]
+# Of a camera's measurement to its row [frames]: half a frame if its clock is known, and what it was found late.
+MAX_LAG = 2.0
 # The arrays of a dataset and of its file. N: nodes, E: elements, F: fixed nodes, M: markers, T: frames.
 MESH_ARRAYS = {
     "vertices": ArrayFormat(("N", 3)),

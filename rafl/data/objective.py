@@ -25,6 +25,7 @@ MIN_RELATIVE_SIGMA = 0.2  # of the median sigma: limits a weight to 25 times the
 # In the image plane a residual beyond this share of the recording's motion (root mean square) counts linearly, no
 # longer squared (Huber's loss): a marker that took its neighbour's dot does not decide the fit.
 HUBER_SHARE = 0.5
+SAME_INSTANT = 1e-6  # of times that rounding explains [frames]
 MIN_HUBER_SIGMAS = 10.0  # the same limit is at least so many reference sigmas, for bodies that hardly move
 
 Objective = Literal["", "image", "3d"]  # empty: in the image plane where a dataset has views
@@ -64,6 +65,15 @@ class CameraTerm:
         chosen = {key: getattr(self, key)[frames][:, recordings][:, :, markers] for key in ("pixel", "root", "scale")}
         cameras = self.cameras[recordings] if isinstance(recordings, slice) else [self.cameras[b] for b in recordings]
         return CameraTerm(cameras, **by_frame, **chosen)
+
+    def up_to(self, frames: NDArray[np.int64]) -> "CameraTerm":
+        """Without measurements later than the last of some leading frames of each recording, (B).
+
+        A simulation that ends there does not show them.
+        """
+        time = torch.arange(len(self.lag), dtype=self.lag.dtype)[:, None] + self.lag
+        within = time <= torch.from_numpy(frames - 1.0 + SAME_INSTANT)
+        return replace(self, root=torch.where(within[..., None, None, None], self.root, 0.0))
 
     def gap(self, markers: Tensor) -> Tensor:
         """Simulated minus measured pixels, (T, B, M, 2), of simulated markers (T, B, M, 3) [m]."""
@@ -162,7 +172,9 @@ class Recordings:
 
     def first_frames(self, frames: int) -> "Recordings":
         """The leading `frames` frames of the same recordings."""
-        return self._index(slice(frames), slice(None), slice(None))
+        part = self._index(slice(frames), slice(None), slice(None))
+        ends = np.full(len(self.names), len(part.markers))
+        return replace(part, terms={name: term.up_to(ends) for name, term in part.terms.items()})
 
     def _index(self, frames: slice, recordings: list[int] | slice, markers: NDArray[np.int64] | slice) -> "Recordings":
         arrays = {
@@ -309,7 +321,8 @@ def _camera_terms(dataset: Dataset, items: list[Trajectory], frames: int, refere
             if view.rotation is not None:
                 rotation[:length, b], translation[:length, b] = view.rotation, view.translation
         arrays = pixel, root, lag, scale, rotation, translation
-        result[name] = CameraTerm(cameras, *(torch.from_numpy(array) for array in arrays))
+        term = CameraTerm(cameras, *(torch.from_numpy(array) for array in arrays))
+        result[name] = term.up_to(np.array([len(item.time) for item in items]))
     return result
 
 

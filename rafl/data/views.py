@@ -16,6 +16,7 @@ Array = NDArray[Any]
 
 # Cameras whose lines of sight differ by less than this [rad] do not show a marker's position along them.
 MIN_ANGLE = 0.1
+NEAR_FRAMES = 6  # that positions are interpolated through
 MAX_PIXEL = 1e6  # no image is larger [px]
 VIEW_ARRAYS = {
     "pixel": ArrayFormat(("T", "M", 2), finite=False, low=-MAX_PIXEL, high=MAX_PIXEL),
@@ -203,21 +204,24 @@ def project(points: Tensor, cameras: list[Camera]) -> Tensor:
 
 
 def at_lags(markers: Tensor, lag: Tensor) -> Tensor:
-    """Markers (T, B, ..) at times that differ from those of the frames, by cubic polynomials through four frames.
+    """Markers (T, B, ..) at times that differ from those of the frames, by polynomials through the six frames around.
+
+    Of an oscillation of 14 frames its error is 4e-5 of the amplitude; through four frames it would be 1e-3.
 
     lag: difference of the times [time steps], (T, B).
     """
     count = len(markers)
-    if count < 4 or not bool((lag != 0.0).any()):
+    if not bool((lag != 0.0).any()):
         return markers
+    near = min(count, NEAR_FRAMES)
     time = torch.arange(count, dtype=lag.dtype)[:, None] + lag
-    first = (time.floor().long() - 1).clamp(0, count - 4)
+    first = (time.floor().long() - (near // 2 - 1)).clamp(0, count - near)
     x = time - first
     batch = torch.arange(lag.shape[1])
     result = torch.zeros_like(markers)
-    for k in range(4):
+    for k in range(near):
         weight = torch.ones_like(x)
-        for other in range(4):
+        for other in range(near):
             if other != k:
                 weight = weight * (x - other) / (k - other)
         result = result + weight.reshape(*weight.shape, *[1] * (markers.ndim - 2)) * markers[first + k, batch]

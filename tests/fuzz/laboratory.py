@@ -14,6 +14,7 @@ import torch
 import trimesh
 import yaml
 from filmed_markers import filmed, pinhole_camera, side_camera
+from scipy.interpolate import CubicSpline
 from support import SMALL_SPECIMEN, draw_frame
 
 from rafl.batch.state import Book, State, Status
@@ -149,7 +150,7 @@ def _write_corrections(path: Path) -> None:
     """One correction of every kind."""
     first, second, *_ = read_tracks(path).names
     who: dict[str, Any] = {"by": "Ann", "camera": "front"}
-    times = [datetime(2026, 1, 1, 0, minute, tzinfo=UTC) for minute in range(5)]
+    times = [datetime(2026, 1, 1, 0, minute, tzinfo=UTC) for minute in range(6)]
     dot = path_text(np.array([2, 3]), np.full((2, 2), 40.0), np.full((2, 2), 0.1))
     entries = (
         Swap(**who, at=times[0], tracks="e" * 64, markers=(first, second), first=3),
@@ -157,30 +158,41 @@ def _write_corrections(path: Path) -> None:
         Place(**who, at=times[2], marker="new", new=True, how="hand", path=dot),
         Delete(**who, at=times[3], marker="new", first=2, last=3),
         Accept(**who, at=times[4], marker=second, first=1, last=2),
+        Delete(**who | {"camera": "late"}, at=times[5], marker=first, first=2, last=3),
     )
     write_corrections(corrections_path(path), entries)
 
 
 def _tracks(names: tuple[str, ...], position: np.ndarray) -> Tracks:
-    """Tracks of one camera, which saw positions (T, M, 3)."""
+    """Tracks of two cameras, which saw positions (T, M, 3); the clock of one is late."""
     frames, count = position.shape[:2]
-    camera = _camera()
+    cameras = {"front": _camera(), "late": side_camera(0.3)}
+    time, late = 0.01 * np.arange(frames), 0.004
+    own = CubicSpline(time, position)(time + late)
+
+    def each(value: np.ndarray) -> dict[str, np.ndarray]:
+        return dict.fromkeys(cameras, value)
+
     return Tracks(
         names=names,
-        time=0.01 * np.arange(frames),
+        time=time,
         position=position,
         sigma=np.full_like(position, 1e-5),
         state=np.ones((frames, count), np.uint8),
-        pixel={"front": camera.project(position)},
-        residual={"front": np.zeros((frames, count))},
-        pixel_sigma={"front": np.full((frames, count, 2), 0.02)},
-        damaged={"front": np.zeros(frames, dtype=bool)},
-        frame={"front": np.arange(frames)},
-        images={"front": {0: b"no image"}},
+        pixel={name: camera.project(position) for name, camera in cameras.items()},
+        residual=each(np.zeros((frames, count))),
+        pixel_sigma=each(np.full((frames, count, 2), 0.02)),
+        damaged=each(np.zeros(frames, dtype=bool)),
+        frame=each(np.arange(frames)),
+        images={"front": {0: b"no image"}, "late": {}},
         fps=100.0,
-        calibration=rig_text(Rig({"front": camera})),
+        calibration=rig_text(Rig(dict(cameras))),
         sources={"front.mp4": "0" * 64},
         settings="of a test",
+        lag={"late": np.full(frames, late)},
+        filmed_time={"late": time + late},
+        filmed_pixel={"late": cameras["late"].project(own)},
+        filmed_sigma={"late": np.full((frames, count, 2), 0.02)},
     )
 
 

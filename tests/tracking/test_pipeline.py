@@ -10,10 +10,11 @@ from support import draw_frame, write_video
 from rafl.calibration.camera import OrthographicCamera, Perspective, Plane
 from rafl.calibration.rig import Rig
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.pipeline import TrackingSettings, track_recording
+from rafl.tracking.pipeline import TrackingSettings, existing_tracks, track_recording
+from rafl.tracking.reconstruction.tracks import write_tracks
 from rafl.tracking.video.reader import open_video
 
-SIZE = (200, 160)
+SIZE, FPS = (200, 160), 100.0
 CAMERA = OrthographicCamera(
     image_size=SIZE, scale=(1e4, 1e4), rotation_vector=(0.0, 0.0, 0.0), plane=Plane((0.0, 0.0, 1.0), 0.0, 1e-4)
 )
@@ -66,3 +67,25 @@ def test_frames_shown_again_are_noted(tmp_path: Path) -> None:
     assert notes_of(tmp_path / "a.mkv", CAMERA) == (
         "a.mkv: frames 3 to 4, 8 show the frame before again while the body moves and count as missing"
     )
+
+
+def test_a_camera_whose_clock_is_late_keeps_what_it_filmed(tmp_path: Path) -> None:
+    """Both films are the same; the right camera's frames are 0.3 frame after the rows, in which dots move by 2 px."""
+    moving_dots(tmp_path / "a.mkv", list(range(12)))
+    videos = {name: open_video(tmp_path / "a.mkv") for name in ("left", "right")}
+    rig = Rig({"left": CAMERA, "right": replace(CAMERA, time_offset=-0.3 / FPS)})
+    settings = TrackingSettings(None, FPS, 3)
+    tracks = track_recording(videos, rig, settings, lambda: None)
+    assert tracks.filmed_pixel.keys() == {"right"}
+    assert tracks.lag["right"] == pytest.approx(0.3 / FPS)
+    assert not tracks.lag["left"].any()
+    assert tracks.filmed_time["right"] == pytest.approx((np.arange(12) + 0.3) / FPS)
+    own = tracks.filmed_pixel["right"][:, 12:]
+    np.testing.assert_allclose(own, tracks.pixel["left"][:, :12], atol=1e-9)
+    moved = tracks.pixel["right"][1:, 12:] - own[1:]
+    np.testing.assert_allclose(moved, np.broadcast_to([-0.6, 0.0], moved.shape), atol=0.1)
+    path = tmp_path / "a.h5"
+    write_tracks(path, tracks)
+    assert existing_tracks(path, videos, rig, settings) is not None
+    write_tracks(path, replace(tracks, filmed_time={}, filmed_pixel={}, filmed_sigma={}))
+    assert existing_tracks(path, videos, rig, settings) is None

@@ -2,7 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass, replace
-from functools import lru_cache, singledispatchmethod
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,23 +11,13 @@ from numpy.typing import NDArray
 
 from rafl.calibration.rig import Rig, parse_calibration
 from rafl.common.errors import InputError
-from rafl.tracking.reconstruction.corrections import (
-    Accept,
-    Correction,
-    Delete,
-    Place,
-    Rename,
-    Swap,
-    corrections_path,
-    read_corrections,
-)
+from rafl.tracking.reconstruction.corrected_pixels import ROW_PIXELS, CorrectedPixels, UnfitError
+from rafl.tracking.reconstruction.corrections import Correction, Place, corrections_path, read_corrections
 from rafl.tracking.reconstruction.gap_filling import FILLED, MEASURED, MISSING, refill_gaps
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
-from rafl.tracking.reconstruction.triangulation import SAME_TIME_FRAMES, CameraPixels, triangulate_some
+from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate_some
 
 Array = NDArray[Any]
-
-LAG_ERROR = 0.5  # of the distance that a dot moves between the time of its frame and that of the row
 
 
 @dataclass(frozen=True)
@@ -92,6 +82,9 @@ def apply_corrections(
 ) -> CorrectedTracks:
     """Apply corrections one after the other, and reconstruct the markers anew in the frames concerned.
 
+    Where a camera's frames do not coincide with the rows, corrections change what it filmed in its frames, and the
+    pixels in the rows follow by the same interpolation as when they were tracked.
+
     Gaps that have, or border on, a corrected measurement are filled anew.
 
     Args:
@@ -104,13 +97,13 @@ def apply_corrections(
     Raises:
         InputError: the tracks hold no calibration.
     """
-    work = _Work(tracks)
+    work = CorrectedPixels(tracks)
     unfit, doubtful = [], []
     own = before.digest if before is not None else tracks_digest(tracks)
     for number, correction in enumerate(corrections, start=1):
         try:
             work.apply(correction)
-        except _UnfitError as error:
+        except UnfitError as error:
             unfit.append(f"{left_out(number, correction)}{error}")
             continue
         if is_doubtful(correction, own):
@@ -118,7 +111,8 @@ def apply_corrections(
                 f"correction {number} ({correction.kind}, by {correction.by}) was made on other tracks: look in "
                 "rafl-review whether it still holds"
             )
-    result, differs = work.tracks, work.changed
+    work.resample()
+    result, differs = work.tracks, work.changed | work.moved
     if before is not None and len(before.tracks.names) == len(result.names):
         known = before.tracks
         differs = _differing(work, before)
@@ -162,173 +156,15 @@ def left_out(number: int, correction: Correction) -> str:
     return f"correction {number} ({correction.kind}, by {correction.by}) is left out: "
 
 
-def _differing(work: "_Work", before: CorrectedTracks) -> NDArray[np.bool_]:
+def _differing(work: CorrectedPixels, before: CorrectedTracks) -> NDArray[np.bool_]:
     """The measurements that are others than before, and the gaps that are to be filled again, (T, M)."""
     differs = before.emptied & ~work.emptied
     columns = np.flatnonzero((work.changed | before.changed).any(axis=0))
-    for key in ("pixel", "pixel_sigma"):
+    for key in ROW_PIXELS:
         for camera, values in getattr(work.tracks, key).items():
             new, old = values[:, columns], getattr(before.tracks, key)[camera][:, columns]
             differs[:, columns] |= ((new != old) & ~(np.isnan(new) & np.isnan(old))).any(axis=-1)
     return differs
-
-
-class _UnfitError(Exception):
-    """A correction does not fit the tracks."""
-
-
-class _Work:
-    """Tracks whose pixels are being corrected; the arrays of a camera are copied before they are changed first."""
-
-    def __init__(self, tracks: Tracks) -> None:
-        self.tracks = replace(tracks, pixel=dict(tracks.pixel), pixel_sigma=dict(tracks.pixel_sigma))
-        self.copied: set[str] = set()  # cameras
-        self.changed = np.zeros(tracks.state.shape, bool)
-        self.accepted = np.zeros(tracks.state.shape, bool)
-        self.emptied = np.zeros(tracks.state.shape, bool)  # where no gap is filled
-
-    @singledispatchmethod
-    def apply(self, correction: Correction) -> None:
-        """Apply a correction.
-
-        Raises:
-            _UnfitError: it does not fit.
-        """
-        raise NotImplementedError
-
-    @apply.register
-    def _(self, correction: Place) -> None:
-        camera = self._camera(correction.camera)
-        values = correction.positions
-        frames = values[:, 0].astype(int)
-        shown, first_rows = np.unique(self.tracks.frame[camera], return_index=True)
-        there = np.minimum(np.searchsorted(shown, frames), len(shown) - 1)
-        if (absent := frames[shown[there] != frames]).size:
-            raise _UnfitError(f"no row of the tracks shows frame {absent[0]} of camera {camera}")
-        if correction.new and correction.marker not in self.tracks.names:
-            self._add_marker(correction.marker)
-        column = self._column(correction.marker)
-        rows = first_rows[there]
-        pixel, sigma = self._at_row_times(camera, column, rows, values[:, 1:3], values[:, 3:])
-        paths, sigmas = self._changeable(camera)
-        paths[rows, column] = pixel
-        sigmas[rows, column] = sigma
-        self.changed[rows, column] = True
-
-    @apply.register
-    def _(self, correction: Delete) -> None:
-        rows, column = self._stretch(correction)
-        camera = correction.camera
-        seen = np.isfinite(self.tracks.pixel_sigma[camera][:, column, 0])
-        if not (rows & seen).any():  # what is deleted is a filled gap
-            self.emptied[rows, column] = True
-        rows &= seen
-        for values in self._changeable(camera):
-            values[rows, column] = np.nan
-        self.changed[rows, column] = True
-
-    @apply.register
-    def _(self, correction: Accept) -> None:
-        rows, column = self._stretch(correction)
-        self.accepted[rows, column] = True
-
-    @apply.register
-    def _(self, correction: Swap) -> None:
-        camera = self._camera(correction.camera)
-        pair = np.array([self._column(marker) for marker in correction.markers])
-        frame = self.tracks.frame[camera]
-        if frame.max() < correction.first:
-            raise _UnfitError(f"camera {camera} has frames up to {frame.max()}, not {correction.first}")
-        rows = np.arange(len(frame)) >= int(np.argmax(frame >= correction.first))
-        first = int(np.argmax(rows))
-        for values in self._changeable(camera):
-            values[first:, pair] = values[first:, pair[::-1]]
-        seen = np.isfinite(self.tracks.pixel_sigma[camera][:, pair, 0]).any(axis=1)
-        self.changed[np.ix_(rows & seen, pair)] = True
-
-    @apply.register
-    def _(self, correction: Rename) -> None:
-        column = self._column(correction.marker)
-        names = list(self.tracks.names)
-        if correction.to in names:
-            raise _UnfitError(f"there is a marker {correction.to} already")
-        names[column] = correction.to
-        try:
-            self.tracks = replace(self.tracks, names=tuple(names))
-        except InputError as error:
-            raise _UnfitError(str(error)) from None
-
-    def _camera(self, camera: str) -> str:
-        if camera not in self.tracks.pixel:
-            raise _UnfitError(f"the tracks have no camera {camera}")
-        return camera
-
-    def _changeable(self, camera: str) -> tuple[Array, Array]:
-        """Pixels and sigmas of a camera that may be changed, (T, M, 2)."""
-        pixel, sigma = self.tracks.pixel, self.tracks.pixel_sigma
-        if camera not in self.copied:
-            self.copied.add(camera)
-            pixel[camera], sigma[camera] = pixel[camera].copy(), sigma[camera].copy()
-        return pixel[camera], sigma[camera]
-
-    def _column(self, marker: str) -> int:
-        if marker not in self.tracks.names:
-            raise _UnfitError(f"the tracks have no marker {marker}")
-        return self.tracks.names.index(marker)
-
-    def _stretch(self, correction: Delete | Accept) -> tuple[NDArray[np.bool_], int]:
-        frame = self.tracks.frame[self._camera(correction.camera)]
-        column = self._column(correction.marker)
-        rows = (frame >= correction.first) & (frame <= correction.last)
-        if correction.last > frame.max() or not rows.any():
-            raise _UnfitError(
-                f"camera {correction.camera} has frames up to {frame.max()}, not {correction.first} to "
-                f"{correction.last}"
-            )
-        return rows, column
-
-    def _add_marker(self, marker: str) -> None:
-        """Add a marker that is missing everywhere, as the last one."""
-        tracks = self.tracks
-
-        def wider(values: Array) -> Array:
-            empty: float = np.nan if values.dtype.kind == "f" else MISSING
-            return np.concatenate([values, np.full_like(values[:, :1], empty)], axis=1)
-
-        try:
-            self.tracks = replace(
-                tracks,
-                names=(*tracks.names, marker),
-                position=wider(tracks.position),
-                sigma=wider(tracks.sigma),
-                state=wider(tracks.state),
-                pixel={camera: wider(values) for camera, values in tracks.pixel.items()},
-                pixel_sigma={camera: wider(values) for camera, values in tracks.pixel_sigma.items()},
-                residual={camera: wider(values) for camera, values in tracks.residual.items()},
-            )
-        except InputError as error:
-            raise _UnfitError(str(error)) from None
-        for key in ("changed", "accepted", "emptied"):
-            setattr(self, key, np.pad(getattr(self, key), ((0, 0), (0, 1))))
-
-    def _at_row_times(
-        self, camera: str, column: int, rows: NDArray[np.int64], pixel: Array, sigma: Array
-    ) -> tuple[Array, Array]:
-        """Pixels and sigmas (F, 2) at the times of rows (F), of a dot that was seen in the frames shown there.
-
-        A camera whose clock is offset shows its frames a little earlier or later than the rows.
-        """
-        lag = self.tracks.lag.get(camera)
-        if lag is None or (np.abs(lag[rows]) * self.tracks.fps < SAME_TIME_FRAMES).all():
-            return pixel, sigma
-        path, time = self.tracks.pixel[camera], self.tracks.time
-        before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(time) - 1)
-        velocity = (path[after] - path[before]) / (time[after] - time[before])[:, None, None]
-        own = velocity[:, column]
-        known = np.isfinite(velocity)
-        others = np.where(known, velocity, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
-        shift = lag[rows, None] * np.where(np.isfinite(own), own, others)
-        return pixel - shift, np.hypot(sigma, LAG_ERROR * shift)
 
 
 def _reconstruct(tracks: Tracks, changed: NDArray[np.bool_], source: Path) -> Tracks:

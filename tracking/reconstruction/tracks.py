@@ -17,13 +17,14 @@ from rafl.common.marker_table import marker_table
 from rafl.common.names import check_names, require_names
 from rafl.common.version import VERSION
 from rafl.common.yaml_files import check_format
+from rafl.tracking.reconstruction.triangulation import HALF_FRAME, SAME_TIME_FRAMES
 
 Array = NDArray[Any]
 
-FORMAT = "rafl-tracks/1"
+FORMAT = "rafl-tracks/2"
 STATES = ("missing", "measured", "filled")  # words for the values of `Tracks.state`
 LABEL = "tracks written by rafl-track"  # in messages about unreadable files
-# The arrays of a tracks file and of each camera in it. T: frames, M: markers.
+# The arrays of a tracks file and of each camera in it. T: frames, M: markers, S: frames of the camera's video.
 TRACKS_ARRAYS = {
     "time": ArrayFormat(("T",)),
     "position": ArrayFormat(("T", "M", 3), finite=False),
@@ -38,6 +39,14 @@ CAMERA_ARRAYS = {
     "frame": ArrayFormat(("T",), "integer", low=-1),
     "lag": ArrayFormat(("T",), optional=True),
 }
+# Of a camera whose frames do not coincide with the rows.
+FILMED_ARRAYS = {
+    "filmed_time": ArrayFormat(("S",), optional=True),
+    "filmed_pixel": ArrayFormat(("S", "M", 2), finite=False, low=-1e6, high=1e6, optional=True),
+    "filmed_sigma": ArrayFormat(("S", "M", 2), finite=False, low=1e-6, high=1e6, optional=True),
+}
+MAX_LAG_FRAMES = 1.05 * HALF_FRAME  # of a frame to the row that shows it; cameras' frame rates may be rounded
+SAME_INSTANT_FRAMES = 1e-3  # difference of two statements about the time of a frame that rounding explains
 PICTURE = ArrayFormat(("bytes",), "integer", low=0, high=255)
 
 
@@ -65,6 +74,10 @@ class Tracks:
         version: of the program that tracked.
         videos: by camera, the path of the video; empty where not known, as in files of earlier programs.
         lag: by camera, time of the frame shown minus that of the row [s], (T); empty where not known.
+        filmed_time: by camera whose frames do not coincide with the rows, the times of all its frames on the clock of
+            `time` [s], (S). Its `pixel` is then one at the times of the rows, interpolated between frames.
+        filmed_pixel: by these cameras, as measured in their frames, (S, M, 2) [px], NaN where not seen.
+        filmed_sigma: of each coordinate, (S, M, 2) [px].
         longest_gap: that was filled [frames]; None where not known.
 
     Raises:
@@ -90,6 +103,9 @@ class Tracks:
     version: str = VERSION
     videos: dict[str, str] = field(default_factory=dict)
     lag: dict[str, Array] = field(default_factory=dict)
+    filmed_time: dict[str, Array] = field(default_factory=dict)
+    filmed_pixel: dict[str, Array] = field(default_factory=dict)
+    filmed_sigma: dict[str, Array] = field(default_factory=dict)
     longest_gap: int | None = None
 
     def __post_init__(self) -> None:
@@ -107,6 +123,24 @@ class Tracks:
     def rows_by_frame(self, camera: str) -> dict[int, int]:
         """By frame number in a camera's video, the first row (index along T) that shows the frame."""
         return {number: row for row, number in reversed(list(enumerate(self.frame[camera].tolist())))}
+
+    def in_frames(self, camera: str) -> tuple[Array, Array]:
+        """Pixels and sigmas [px], (T, M, 2) each, in the frame of a camera that each row shows; NaN where not seen."""
+        if camera not in self.filmed_time:
+            return self.pixel[camera], self.pixel_sigma[camera]
+        frame = self.frame[camera]
+        shown = (frame >= 0)[:, None, None]
+        pixel, sigma = self.filmed_pixel[camera][frame], self.filmed_sigma[camera][frame]
+        return np.where(shown, pixel, np.nan), np.where(shown, sigma, np.nan)
+
+    def lacks_filmed(self, camera: str) -> bool:
+        """Whether a camera's pixels are interpolated between its frames, and those of the frames are not known.
+
+        So it is in files of earlier programs.
+        """
+        lag = self.lag.get(camera)
+        late = lag is not None and bool((np.abs(lag) * self.fps >= SAME_TIME_FRAMES).any())
+        return late and camera not in self.filmed_time
 
 
 def write_tracks(path: str | Path, tracks: Tracks) -> None:
@@ -136,7 +170,7 @@ def write_tracks(path: str | Path, tracks: Tracks) -> None:
         for key in TRACKS_ARRAYS:
             file.create_dataset(key, data=getattr(tracks, key), fletcher32=True)
         for name in tracks.pixel:
-            for key in CAMERA_ARRAYS:
+            for key in CAMERA_ARRAYS | FILMED_ARRAYS:
                 if name in getattr(tracks, key):
                     file.create_dataset(f"cameras/{name}/{key}", data=getattr(tracks, key)[name], fletcher32=True)
             if name in tracks.videos:
@@ -191,16 +225,17 @@ def _read(file: h5py.File, folder: Path) -> Tracks:
         raise ValueError("position: expected finite numbers where the state is not missing")
     cameras = file.get("cameras", {})
     check_names(cameras)
-    by_camera = {
-        name: read_arrays(group, CAMERA_ARRAYS, lengths, f"cameras/{name}/") for name, group in cameras.items()
-    }
+    by_camera = {name: _read_camera(group, name, time, about.fps, lengths) for name, group in cameras.items()}
     return Tracks(
         names=about.marker_names,
         time=time,
         position=arrays["position"],
         sigma=arrays["sigma"],
         state=arrays["state"].astype(np.uint8),
-        **{key: {name: found[key] for name, found in by_camera.items() if key in found} for key in CAMERA_ARRAYS},
+        **{
+            key: {name: found[key] for name, found in by_camera.items() if key in found}
+            for key in CAMERA_ARRAYS | FILMED_ARRAYS
+        },
         images={name: _read_images(group, f"cameras/{name}/pictures") for name, group in cameras.items()},
         fps=about.fps,
         calibration=about.calibration,
@@ -215,6 +250,34 @@ def _read(file: h5py.File, folder: Path) -> Tracks:
         },
         longest_gap=about.longest_gap,
     )
+
+
+def _read_camera(group: h5py.Group, name: str, time: Array, fps: float, lengths: dict[str, int]) -> dict[str, Array]:
+    """The arrays of one camera by key.
+
+    Raises:
+        ValueError: an array differs from its description, or arrays contradict one another.
+    """
+    label = f"cameras/{name}"
+    found = read_arrays(group, CAMERA_ARRAYS | FILMED_ARRAYS, dict(lengths), f"{label}/")
+    frame, lag = found["frame"], found.get("lag")
+    shown = frame >= 0
+    if lag is not None and (late := np.abs(lag[shown]).max(initial=0.0)) * fps > MAX_LAG_FRAMES:
+        raise ValueError(f"{label}/lag: expected times within half a frame interval of the rows', found {late:g} s")
+    there = FILMED_ARRAYS.keys() & found.keys()
+    if not there:
+        return found
+    if lag is None or len(there) < len(FILMED_ARRAYS):
+        lacking = sorted(({"lag"} | FILMED_ARRAYS.keys()) - found.keys())
+        raise ValueError(f"expected the array {label}/{lacking[0]} beside {label}/{min(there)}, found none")
+    own = found["filmed_time"]
+    if len(own) < 2 or (np.diff(own) <= 0.0).any():
+        raise ValueError(f"{label}/filmed_time: expected two frames or more, each later than the one before")
+    if frame.max(initial=-1) >= len(own):
+        raise ValueError(f"{label}/frame: expected frames up to {len(own) - 1} as in filmed_time, found {frame.max()}")
+    if np.abs(own[frame] - time - lag)[shown].max(initial=0.0) * fps > SAME_INSTANT_FRAMES:
+        raise ValueError(f"{label}/lag: expected filmed_time minus time, found another time of a frame")
+    return found
 
 
 def _read_images(camera: h5py.Group, label: str) -> dict[int, bytes]:

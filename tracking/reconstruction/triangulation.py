@@ -14,6 +14,7 @@ from rafl.common.errors import InputError
 Array = NDArray[Any]
 
 SAME_TIME_FRAMES = 0.02  # times that differ by less than this need no interpolation [frame intervals]
+HALF_FRAME = 0.5 + 0.5 * SAME_TIME_FRAMES  # how far from a row the frame may be that it shows [frame intervals]
 # A camera is an outlier if its residual exceeds so many sigmas plus so many pixels.
 OUTLIER_SIGMAS, OUTLIER_PIXELS = 6.0, 1.5
 MAX_ITERATIONS = 8  # of Gauss-Newton; a pinhole camera's equations are not quite linear
@@ -72,9 +73,22 @@ def nearest_frames(own: Array, requested: Array) -> NDArray[np.int64]:
 
 
 def shown_frames(own: Array, requested: Array) -> NDArray[np.int64]:
-    """Index of the frame shown at each requested time (T): the nearest, -1 if it is over half a frame interval away."""
-    nearest = nearest_frames(own, requested)
-    return np.where(np.abs(own[nearest] - requested) <= 0.5 * np.median(np.diff(own)), nearest, -1)
+    """Index of the frame shown at each requested time (T): the nearest, -1 if it is over half a frame interval away.
+
+    The later of two frames that are as near, as those of a camera that is half a frame late are throughout.
+    """
+    interval = float(np.median(np.diff(own)))
+    after = np.clip(np.searchsorted(own, requested), 1, len(own) - 1)
+    nearer = requested - own[after - 1] < own[after] - requested - SAME_TIME_FRAMES * interval
+    shown = np.where(nearer, after - 1, after)
+    return np.where(np.abs(own[shown] - requested) <= HALF_FRAME * interval, shown, -1)
+
+
+def coincide(own: Array, requested: Array) -> bool:
+    """Whether every requested time (T) that shows a frame is the frame's own, for frames at times `own` (S) [s]."""
+    shown = shown_frames(own, requested)
+    apart = np.abs(own[shown] - requested)[shown >= 0]
+    return bool((apart < SAME_TIME_FRAMES * np.median(np.diff(own))).all())
 
 
 def triangulate(rig: Rig, pixels: dict[str, CameraPixels]) -> tuple[Array, Array, dict[str, Array]]:

@@ -20,9 +20,9 @@ def block(recording: OpenRecording, rig: Rig | None, first: int, count: int) -> 
     """Rows of tracks (R = `count`).
 
     In order: time [s] (R); state, whether changed (R, M); position, sigma [mm] (R, M, 3); and for each camera:
-    frame, whether damaged (R); kind (R, M): 0 not in this camera, 1 measured, 2 filled, 3 missing; pixel, its sigma
-    [px] (R, M, 2), of a missing marker between where it was seen last and next; residual [px] (R, M), NaN where no
-    other camera sees the marker.
+    frame, whether damaged (R); kind (R, M): 0 not in this camera, 1 measured, 2 filled, 3 missing; pixel in the frame,
+    its sigma [px] (R, M, 2), of a missing marker between where it was seen last and next; residual [px] (R, M), NaN
+    where no other camera sees the marker.
 
     Raises:
         InputError: there are no such rows.
@@ -34,10 +34,11 @@ def block(recording: OpenRecording, rig: Rig | None, first: int, count: int) -> 
     parts = [tracks.time[rows], tracks.state[rows], recording.found.changed[rows]]
     parts += [1e3 * tracks.position[rows], 1e3 * tracks.sigma[rows]]
     views = np.sum([np.isfinite(sigma[rows, :, 0]) for sigma in tracks.pixel_sigma.values()], axis=0)
-    for camera, path in tracks.pixel.items():
+    for camera in tracks.pixel:
+        path, path_sigma = tracks.in_frames(camera)
         seen = np.isfinite(path[..., 0])
         known = seen.any(axis=0)
-        pixel, sigma = path[rows].copy(), tracks.pixel_sigma[camera][rows].copy()
+        pixel, sigma = path[rows].copy(), path_sigma[rows].copy()
         kind = np.where(seen[rows], MEASURED_HERE, np.where(known, LOST_HERE, ELSEWHERE))
         filled = (tracks.state[rows] == FILLED) & ~seen[rows] & known
         if rig is not None and filled.any():
@@ -59,6 +60,8 @@ def block(recording: OpenRecording, rig: Rig | None, first: int, count: int) -> 
 def series(recording: OpenRecording, marker: int, camera: str) -> bytes:
     """One marker over time, (T) each: x, y, z, sigma [mm]; pixel x, y, its sigma, residual [px] of a camera; state.
 
+    The pixels are those in the camera's frames.
+
     Raises:
         InputError: there is no such marker or camera.
     """
@@ -66,11 +69,12 @@ def series(recording: OpenRecording, marker: int, camera: str) -> bytes:
     if not 0 <= marker < len(tracks.names) or camera not in tracks.pixel:
         raise InputError("expected a marker and a camera of the recording, found others; load the page again")
     views = np.sum([np.isfinite(sigma[:, marker, 0]) for sigma in tracks.pixel_sigma.values()], axis=0)
+    path, path_sigma = tracks.in_frames(camera)
     parts = [
         *(1e3 * tracks.position[:, marker].T),
         1e3 * np.linalg.norm(tracks.sigma[:, marker], axis=1),
-        *tracks.pixel[camera][:, marker].T,
-        tracks.pixel_sigma[camera][:, marker].max(axis=1),
+        *path[:, marker].T,
+        path_sigma[:, marker].max(axis=1),
         np.where(views > 1, tracks.residual[camera][:, marker], np.nan),
         tracks.state[:, marker],
     ]

@@ -113,7 +113,7 @@ def _dot(recording: OpenRecording, camera: str, row: int, position: Array, marke
     image = recording.frames(camera).image(_frame(recording, camera, row))
     if image is None:
         raise InputError("the frame is damaged")
-    names, pixel = recording.tracks.names, recording.tracks.pixel[camera][row]
+    names, pixel = recording.tracks.names, recording.tracks.in_frames(camera)[0][row]
     others = np.array([name != marker for name in names])
     found = dot_at(image, position, pixel[others])
     if found is None:
@@ -166,7 +166,7 @@ def _check_inside(recording: OpenRecording, action: Action) -> None:
 
 def _taken_by(recording: OpenRecording, action: Action, dot: PointedDot) -> str:
     """The other marker that has a dot already; empty if none has."""
-    pixel = recording.tracks.pixel[action.camera][action.row]
+    pixel = recording.tracks.in_frames(action.camera)[0][action.row]
     distance = np.nan_to_num(np.linalg.norm(pixel - dot.centre, axis=1), nan=np.inf)
     for marker in np.argsort(distance)[:2].tolist():
         if distance[marker] < dot.appearance.radius and recording.tracks.names[marker] != action.marker:
@@ -178,7 +178,7 @@ def _follow(recording: OpenRecording, action: Action) -> dict[str, object]:
     tracks = recording.tracks
     if action.marker not in tracks.names or action.camera not in tracks.pixel:
         raise InputError("expected a marker and a camera of the tracks; load the page again")
-    marker, path = tracks.names.index(action.marker), tracks.pixel[action.camera]
+    marker, path = tracks.names.index(action.marker), tracks.in_frames(action.camera)[0]
     if not np.isfinite(path[action.row, marker, 0]):
         raise InputError(f"{action.marker} has no dot here to follow; set it first")
     start = _dot(recording, action.camera, action.row, path[action.row, marker], action.marker)

@@ -93,7 +93,7 @@ DAMAGE: dict[str, tuple[Callable[[h5py.Group], None], str]] = {
     "indefinite": (entry("left/covariance", (3, 2), [[1.0, 2.0], [2.0, 1.0]]), f"{LEFT}/{POSITIVE}"),
     "not symmetric": (entry("left/covariance", (3, 2), [[1.0, 0.5], [0.0, 1.0]]), f"{LEFT}/{POSITIVE}"),
     "tiny": (put("left/covariance", lambda x: 1e-290 * x), f"{LEFT}/{POSITIVE}"),
-    "late": (entry("left/lag", 3, 0.05), f"{LEFT}/lag: expected times within 1 frames"),
+    "late": (entry("left/lag", 3, 0.05), f"{LEFT}/lag: expected times within 2 frames"),
     "no calibration": (lambda views: views.attrs.__delitem__("calibration"), "trajectories/b/views: expected a group"),
     "number": (attribute(5), CALIBRATION),
     "no YAML": (attribute("x: ["), f"{CALIBRATION}: .* not readable as YAML"),
