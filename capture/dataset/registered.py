@@ -8,18 +8,19 @@ from numpy.typing import NDArray
 
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
+from rafl.capture.registration.averaging import average_frames, average_views
 from rafl.capture.registration.camera_change import CameraChange, positions_at
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.motion_start import MotionStart, find_motion_start
 from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.recording import Recording
-from rafl.capture.registration.registration import Registration, average_frames, fit_pose_near_clamp
+from rafl.capture.registration.registration import Registration, fit_pose_near_clamp
 from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, RigidTransform, pose_sigma
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.markers import Markers
-from rafl.data.views import View, seen_axes
+from rafl.data.views import View
 
 Array = NDArray[Any]
 
@@ -129,39 +130,6 @@ def _in_frame(views: dict[str, View], pose: RigidTransform) -> dict[str, View]:
         name: replace(view, camera=view.camera.in_frame(pose.rotation, pose.translation))
         for name, view in views.items()
     }
-
-
-def average_views(views: dict[str, View], near: Array) -> tuple[Array, Array, Array]:
-    """Positions that the cameras measured on average over some frames, and in which directions.
-
-    Args:
-        views: by camera.
-        near: positions about which the projection is linearised [m], (M, 3), NaN where not known.
-
-    Returns:
-        Positions [m], (M, 3), NaN where no camera saw the marker, and its measured directions as in
-        `rafl.data.views.seen_axes`. In directions that were not measured a position stays near the given one.
-    """
-    means = {}
-    for name, view in ((name, view.without_motion(near)) for name, view in views.items()):
-        known = np.isfinite(near[:, :1])
-        pixel, sigma = average_frames(view.pixel, np.sqrt(np.diagonal(view.covariance, axis1=-2, axis2=-1)))
-        seen = known & np.isfinite(sigma)
-        pixel, sigma = np.where(seen, pixel, np.nan), np.where(seen, sigma, np.nan)
-        means[name] = replace(
-            view, pixel=pixel[None], covariance=(sigma**2)[None, ..., None] * np.eye(2), lag=np.zeros(1)
-        )
-    axes, sigma = seen_axes(means, near)
-    target = np.where(np.isfinite(sigma[:, :1]), near, np.nan)
-    # One Gauss-Newton step towards the mean pixels, in the measured directions.
-    step = np.zeros_like(target)
-    for view in means.values():
-        seen = view.seen[0]
-        slope = view.jacobian(near[seen])[0]
-        gap = view.pixel[0, seen] - view.project(near[seen])[0]
-        step[seen] += (slope.swapaxes(1, 2) @ np.linalg.solve(view.covariance[0, seen], gap[..., None]))[..., 0]
-    along = np.where(np.isfinite(sigma), sigma, 0.0) ** 2 * (axes @ step[..., None])[..., 0]
-    return target + (axes.swapaxes(1, 2) @ along[..., None])[..., 0], axes, sigma
 
 
 def find_dataset_places(

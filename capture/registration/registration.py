@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.capture.registration.averaging import average_frames
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.rigid import (
     IDENTITY,
@@ -22,7 +23,6 @@ from rafl.data.dataset import THROUGH_MODEL
 
 Array = NDArray[Any]
 
-UNOBSERVED_SIGMA = 1.0  # [m], assumed for a coordinate that was not observed
 # Assumed bending of the marker farthest from the clamp, as a fraction of its distance; it grows quadratically.
 BENDING_FRACTION = 0.3
 
@@ -96,30 +96,6 @@ def fit_rest(recording: Recording, rest_pose: RestPose, specimen: Specimen, tole
     position, sigma = average_frames(recording.position[first : last + 1], recording.sigma[first : last + 1])
     fit = _fit_within_tolerance(position, sigma, specimen, tolerance, f"--rest {rest_pose.recording}")
     return RestFit(fit, fit.transform.apply(position)[len(specimen.layout.names) :])
-
-
-def average_frames(position: Array, sigma: Array) -> tuple[Array, Array]:
-    """Weighted mean over frames and its sigma [m], (M, 3).
-
-    Averaging reduces only the part of the variance that is seen as scatter between the frames; the rest of sigma is
-    systematic and stays.
-
-    Args:
-        position, sigma: [m], (T, M, 3), NaN where missing.
-
-    Returns:
-        Mean, NaN for markers that are missing in all frames, and sigma, infinite for these.
-    """
-    sigma = np.where(np.isfinite(sigma), sigma, UNOBSERVED_SIGMA)
-    measured = np.isfinite(position[..., :1])
-    weight = np.where(measured, 1.0 / np.where(measured, sigma, 1.0) ** 2, 0.0)
-    total, count = weight.sum(axis=0), measured.sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (weight * np.where(measured, position, 0.0)).sum(axis=0) / total
-        variance = count / total  # of one frame
-        scatter = np.where(measured, (position - mean) ** 2, 0.0).sum(axis=0) / np.maximum(count - 1, 1)
-        white = np.minimum(scatter, variance)
-        return mean, np.where(total > 0, np.sqrt(variance - white + white / count), np.inf)
 
 
 def _fit_within_tolerance(position: Array, sigma: Array, specimen: Specimen, tolerance: float, label: str) -> RigidFit:

@@ -57,6 +57,12 @@ class View:
         seen: NDArray[np.bool_] = np.isfinite(self.pixel[..., 0])
         return seen
 
+    @property
+    def viewing_directions(self) -> Array:
+        """Lines of sight at the image centre: unit vectors away from the camera in the specimen frame, (T or 1, 3)."""
+        direction = self.camera.viewing_direction[None]
+        return direction if self.rotation is None else np.asarray((self.rotation @ direction[..., None])[..., 0])
+
     def select_markers(self, chosen: NDArray[np.int64]) -> "View":
         """The measurements of the given markers; NaN for the index -1."""
         gone = chosen < 0
@@ -64,7 +70,7 @@ class View:
         pixel[:, gone], covariance[:, gone] = np.nan, np.nan
         return replace(self, pixel=pixel, covariance=covariance)
 
-    def select_frames(self, chosen: slice) -> "View":
+    def select_frames(self, chosen: slice | NDArray[np.bool_]) -> "View":
         """The measurements in some frames."""
         arrays: dict[str, Any] = {key: getattr(self, key) for key in VIEW_ARRAYS if getattr(self, key) is not None}
         return replace(self, **{key: array[chosen] for key, array in arrays.items()})
@@ -166,15 +172,17 @@ def seen_axes(views: Mapping[str, View], position: Array) -> tuple[Array, Array]
 
     Returns:
         Orthonormal rows for every marker, (M, 3, 3), and the sigma along each [m], (M, 3), largest last; infinite where
-        no camera measured.
+        no camera measured. The last row points away from the cameras.
     """
-    information = np.zeros((len(position), 3, 3))
+    information, away = np.zeros((len(position), 3, 3)), np.zeros_like(position)
     for view in views.values():
         seen = view.seen[0]
         slope = view.jacobian(position[seen])[0]
         information[seen] += slope.swapaxes(1, 2) @ np.linalg.solve(view.covariance[0, seen], slope)
+        away[seen] += view.viewing_directions[0]
     values, vectors = np.linalg.eigh(information)
-    values, axes = values[:, ::-1], vectors[:, :, ::-1].swapaxes(1, 2)
+    values, axes = values[:, ::-1], vectors[:, :, ::-1].swapaxes(1, 2).copy()
+    axes[:, 2] *= np.where((axes[:, 2] * away).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
     known = values > MIN_ANGLE**2 * np.maximum(values[:, 1:2], 1e-300)
     sigma = np.full(values.shape, np.inf)
     sigma[known] = values[known] ** -0.5

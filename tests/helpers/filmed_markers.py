@@ -1,4 +1,4 @@
-"""Datasets whose markers were filmed: exact positions become pixels of given cameras."""
+"""Datasets and tracks whose markers were filmed: exact positions become pixels of given cameras."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,8 +7,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera
+from rafl.calibration.rig import Rig, rig_text
 from rafl.data.dataset import Dataset, Trajectory
 from rafl.data.views import View
+from rafl.tracking.reconstruction.tracks import Tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
 
 SIZE = (1280, 720)
 PIXELS_PER_METRE = 8000.0
@@ -80,4 +83,49 @@ def filmed(
             name: replace(item, views={key: view(camera, item) for key, camera in cameras.items()})
             for name, item in dataset.trajectories.items()
         },
+    )
+
+
+def filmed_tracks(
+    names: tuple[str, ...],
+    exact: np.ndarray,
+    cameras: Mapping[str, Camera],
+    sigma: float = 0.02,
+    noise: np.ndarray | float = 0.0,
+    seen: Mapping[str, np.ndarray] | None = None,
+) -> Tracks:
+    """Tracks of markers at exact positions in the cameras' frame, at 100 frames/s.
+
+    Args:
+        names: of the markers, (M).
+        exact: [m], (T, M, 3).
+        cameras: by name.
+        sigma: of the pixels [px].
+        noise: their errors [px], (T, M, 2).
+        seen: which markers each camera sees, (M); all if None.
+    """
+    pixels, frames = {}, len(exact)
+    for name, camera in cameras.items():
+        kept = np.ones(len(names), bool) if seen is None else seen[name]
+        pixel = np.where(kept[:, None], camera.project(exact) + noise, np.nan)
+        pixels[name] = CameraPixels(pixel, np.where(np.isfinite(pixel), sigma, np.nan))
+    rig = Rig(dict(cameras))
+    position, position_sigma, residual = triangulate(rig, pixels)
+    return Tracks(
+        names=names,
+        time=np.arange(frames) / 100.0,
+        position=position,
+        sigma=position_sigma,
+        state=np.isfinite(position[..., 0]).astype(np.uint8),
+        pixel={name: item.pixel for name, item in pixels.items()},
+        residual=residual,
+        pixel_sigma={name: item.sigma for name, item in pixels.items()},
+        damaged={name: np.zeros(frames, bool) for name in pixels},
+        frame={name: np.arange(frames) for name in pixels},
+        images={name: {} for name in pixels},
+        fps=100.0,
+        calibration=rig_text(rig),
+        sources={},
+        settings="",
+        longest_gap=5,
     )

@@ -178,7 +178,7 @@ def test_seen_axes_of_one_and_two_cameras() -> None:
     metres = 0.02 / PIXELS_PER_METRE
     np.testing.assert_allclose(sigma[0], [metres * np.sqrt(0.8), metres, 2.0 * metres])  # z twice, x, y
     np.testing.assert_allclose(sigma[1], [metres, metres, np.inf])
-    np.testing.assert_allclose(np.abs(axes[1, 2]), [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(axes[1, 2], [0.0, 1.0, 0.0], atol=1e-12)  # away from the camera
     assert np.isinf(sigma[2]).all()
 
 
