@@ -82,3 +82,22 @@ def average_recording(recording: Recording, chosen: slice | NDArray[np.bool_]) -
     if recording.views:
         return average_views({name: view.select_frames(chosen) for name, view in recording.views.items()}, position)
     return position, np.broadcast_to(np.eye(3), (len(position), 3, 3)), sigma
+
+
+def measured_directions(recording: Recording) -> tuple[Array, Array, Array]:
+    """As `average_recording`, but of every frame: (T, M, 3), (T, M, 3, 3) and (T, M, 3)."""
+    position, shape = recording.position, recording.position.shape
+    if not recording.views:
+        return position, np.broadcast_to(np.eye(3), (*shape, 3)), recording.sigma
+    # The cameras are at rest, so that the markers of all frames can be those of one.
+    views = {
+        name: replace(
+            view,
+            pixel=view.pixel.reshape(1, -1, 2),
+            covariance=view.covariance.reshape(1, -1, 2, 2),
+            lag=np.zeros(1),
+        )
+        for name, view in recording.views.items()
+    }
+    found, axes, sigma = average_views(views, position.reshape(-1, 3))
+    return found.reshape(shape), axes.reshape(*shape, 3), sigma.reshape(shape)
