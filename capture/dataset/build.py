@@ -309,4 +309,5 @@ class _EvenGrid:
             self.fill(view.lag, 0.0),
             None if view.rotation is None else view.rotation[recorded],
             None if view.translation is None else view.translation[recorded],
+            None if view.pose_covariance is None else view.pose_covariance[recorded],
         )

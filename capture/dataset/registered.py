@@ -59,6 +59,8 @@ class Registered:
         own = len(specimen.layout.names)
         position = registration.pose.apply(recording.position[:, :own])
         sigma = registration.pose.rotate_sigma(recording.sigma[:, :own])
+        if registration.covariance.ndim > 2:
+            sigma = np.hypot(sigma, pose_sigma(registration.covariance[:, None], position))
         position[:, [name in registration.outliers for name in specimen.layout.names]] = np.nan
         # Positions as recorded: if a clamp marker jumps, a specimen at rest would seem to move in the clamp's frame.
         start = _motion_start(recording.position[:, :own], row, settings)
@@ -72,7 +74,7 @@ class Registered:
             [k if name not in registration.outliers else -1 for k, name in enumerate(specimen.layout.names)]
         )
         views = {camera: view.select_markers(kept) for camera, view in recording.views.items()}
-        views = _in_frame(views, registration.pose)
+        views = _in_frame(views, registration.pose, registration.covariance)
         return cls(recording, row, registration, position, sigma, start, last, views)
 
     def with_changes(self, changes: dict[str, CameraChange]) -> "Registered":
@@ -96,7 +98,7 @@ class Registered:
         position = places.pose.apply(self.position)
         by_pose = pose_sigma(places.pose_covariance, position)
         sigma = np.hypot(places.pose.rotate_sigma(self.sigma), by_pose)
-        views = _in_frame(self.views, places.pose)
+        views = _in_frame(self.views, places.pose, places.pose_covariance)
         return replace(self, registration=registration, position=position, sigma=sigma, views=views)
 
     def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
@@ -118,13 +120,17 @@ class Registered:
         return FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface, axes=axes)
 
 
-def _in_frame(views: dict[str, View], pose: RigidTransform) -> dict[str, View]:
-    """The views in the specimen frame, to which a pose leads from the cameras' frame, one or one for every frame."""
+def _in_frame(views: dict[str, View], pose: RigidTransform, covariance: Array) -> dict[str, View]:
+    """The views in the specimen frame, to which a pose leads from the cameras' frame, one or one for every frame.
+
+    covariance: of the pose, which views contain where it differs from frame to frame.
+    """
     if pose is IDENTITY:
         return views
     if pose.rotation.ndim > 2:
         return {
-            name: replace(view, rotation=pose.rotation, translation=pose.translation) for name, view in views.items()
+            name: replace(view, rotation=pose.rotation, translation=pose.translation, pose_covariance=covariance)
+            for name, view in views.items()
         }
     return {
         name: replace(view, camera=view.camera.in_frame(pose.rotation, pose.translation))

@@ -8,8 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import FirstFrame, linear_modes
-from rafl.capture.registration.rigid import IDENTITY, RigidTransform, pose_jacobian
+from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 from rafl.common.errors import SimulationError
+from rafl.data.views import pose_jacobian
 
 Array = NDArray[Any]
 

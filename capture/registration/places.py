@@ -15,8 +15,9 @@ from rafl.capture.registration.initial import (
     linear_jacobian,
     modulus_slope,
 )
-from rafl.capture.registration.rigid import RigidTransform, pose_jacobian
+from rafl.capture.registration.rigid import RigidTransform
 from rafl.data.markers import Markers, embed
+from rafl.data.views import pose_jacobian
 
 Array = NDArray[Any]
 

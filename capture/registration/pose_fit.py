@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from rafl.capture.registration.rigid import MIN_MARKERS, RigidTransform, kabsch, pose_jacobian
+from rafl.capture.registration.rigid import MIN_MARKERS, RigidTransform, kabsch
+from rafl.data.views import pose_jacobian
 
 Array = NDArray[Any]
 

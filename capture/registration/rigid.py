@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from rafl.data.views import pose_jacobian
+
 Array = NDArray[Any]
 
 MIN_MARKERS = 3
@@ -53,16 +55,10 @@ class RigidTransform:
         return np.asarray(np.sqrt(sigma**2 @ np.swapaxes(self.rotation, -1, -2) ** 2))
 
 
-def pose_jacobian(points: Array) -> Array:
-    """Derivatives of transformed points (..., 3) by a rotation vector and a translation afterwards, (..., 3, 6)."""
-    rotation = np.cross(np.eye(3), points[..., None, :]).swapaxes(-1, -2)
-    return np.concatenate([rotation, np.broadcast_to(np.eye(3), rotation.shape)], axis=-1)
-
-
 def pose_sigma(covariance: Array, points: Array) -> Array:
-    """Sigmas [m] of transformed points (..., 3) [m] that follow from the covariance (6, 6) of the transform."""
+    """Sigmas [m] of transformed points (..., 3) [m] that follow from the covariance (..., 6, 6) of the transform."""
     by_pose = pose_jacobian(points)
-    return np.asarray(np.sqrt(np.einsum("...ij,jk,...ik->...i", by_pose, covariance, by_pose)))
+    return np.asarray(np.sqrt(np.einsum("...ij,...jk,...ik->...i", by_pose, covariance, by_pose)))
 
 
 IDENTITY = RigidTransform(np.eye(3), np.zeros(3))

@@ -23,6 +23,7 @@ VIEW_ARRAYS = {
     "lag": ArrayFormat(("T",)),
     "rotation": ArrayFormat(("T", 3, 3), optional=True),
     "translation": ArrayFormat(("T", 3), optional=True),
+    "pose_covariance": ArrayFormat(("T", 6, 6), optional=True),
 }
 MAX_ROTATION_ERROR = 1e-6  # of the elements of R^T R - 1
 # What measurements of a camera can be; others are damage.
@@ -42,6 +43,8 @@ class View:
         lag: time at which this camera measured minus that of the recording's frame [s], (T).
         rotation, translation: of a moving specimen frame when this camera measured: a point X in the frame at rest has
             the coordinates R X + t in it, (T, 3, 3) and [m], (T, 3); None if the specimen frame is at rest.
+        pose_covariance: of a rotation vector and a translation applied after R and t [rad, m], (T, 6, 6), whose errors
+            differ from frame to frame and are those of all cameras; None if they are exactly known.
     """
 
     camera: Camera
@@ -50,6 +53,7 @@ class View:
     lag: Array
     rotation: Array | None = None
     translation: Array | None = None
+    pose_covariance: Array | None = None
 
     @property
     def seen(self) -> NDArray[np.bool_]:
@@ -84,6 +88,11 @@ class View:
         slope = self.camera.jacobian(self._at_rest(points))
         return slope if self.rotation is None else slope @ self.rotation.swapaxes(1, 2)[:, None]
 
+    def pose_slope(self, points: Array) -> Array:
+        """Derivatives of `project` by a turn and a shift of the specimen frame [px/rad, px/m], (T, M, 2, 6)."""
+        slope: Array = -self.jacobian(points) @ pose_jacobian(points)
+        return slope
+
     def _at_rest(self, points: Array) -> Array:
         """Points (T, M, 3) in the camera's frame."""
         if self.rotation is None or self.translation is None:
@@ -94,13 +103,19 @@ class View:
     def without_motion(self, near: Array) -> "View":
         """The view as if the specimen frame had stayed where it was in the first frame.
 
+        The errors of its pose become errors of the pixels.
+
         near: positions [m], (M, 3), for which the pixels are exact; elsewhere to first order.
         """
         if self.rotation is None or self.translation is None:
             return self
         camera = self.camera.in_frame(self.rotation[0], self.translation[0])
-        pixel = self.pixel + (camera.project(near) - self.project(near))
-        return replace(self, camera=camera, pixel=pixel, rotation=None, translation=None)
+        pixel, covariance = self.pixel + (camera.project(near) - self.project(near)), self.covariance
+        if self.pose_covariance is not None:
+            slope = self.pose_slope(near)
+            covariance = covariance + slope @ self.pose_covariance[:, None] @ slope.swapaxes(-1, -2)
+        still = replace(self, rotation=None, translation=None, pose_covariance=None)
+        return replace(still, camera=camera, pixel=pixel, covariance=covariance)
 
     def scale(self, points: Array) -> Array:
         """Scale of the image at points (T, M, 3) [px/m], the geometric mean of both directions, (T, M)."""
@@ -135,6 +150,12 @@ class View:
             error = np.abs(self.rotation.swapaxes(1, 2) @ self.rotation - np.eye(3)).max(initial=0.0)
             if error > MAX_ROTATION_ERROR or (np.linalg.det(self.rotation) < 0.0).any():
                 raise ValueError(f"{label}/rotation: expected rotation matrices")
+        if self.pose_covariance is not None:
+            own = self.pose_covariance
+            if self.rotation is None or not np.allclose(own, own.swapaxes(1, 2), rtol=1e-6, atol=0.0):
+                raise ValueError(f"{label}/pose_covariance: expected symmetric matrices of a moving frame's poses")
+            if not (np.linalg.eigvalsh(own) >= 0.0).all():
+                raise ValueError(f"{label}/pose_covariance: expected positive definite matrices")
         self._check_camera(label, positions)
 
     def _check_camera(self, label: str, positions: Array) -> None:
@@ -153,6 +174,12 @@ class View:
             raise ValueError(
                 f"{label}: expected a camera that shows the markers with {MIN_SCALE:g} to {MAX_SCALE:g} px/m"
             )
+
+
+def pose_jacobian(points: Array) -> Array:
+    """Derivatives of transformed points (..., 3) by a rotation vector and a translation afterwards, (..., 3, 6)."""
+    rotation = np.cross(np.eye(3), points[..., None, :]).swapaxes(-1, -2)
+    return np.concatenate([rotation, np.broadcast_to(np.eye(3), rotation.shape)], axis=-1)
 
 
 def leave_moving_frame(points: Any, rotation: Any, translation: Any) -> Any:

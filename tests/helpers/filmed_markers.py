@@ -15,6 +15,7 @@ from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
 
 SIZE = (1280, 720)
 PIXELS_PER_METRE = 8000.0
+POSE_SIGMA = np.array([1e-4, 2e-4, 1e-4, 5e-6, 2e-6, 5e-6])  # of a moving frame [rad, m]
 
 
 def side_camera(angle: float, distortion: tuple[float, float] = (0.0, 0.0)) -> OrthographicCamera:
@@ -64,7 +65,7 @@ def filmed(
         cameras: in the specimen frame where it starts.
         sigma: of the pixels [px].
         noise: adds errors of this sigma to the pixels; none if None.
-        moving: whether the specimen frame turns by 6 degrees and shifts by 5 mm.
+        moving: whether the specimen frame turns by 6 degrees and shifts by 5 mm, as known to POSE_SIGMA.
     """
 
     def view(camera: Camera, item: Trajectory) -> View:
@@ -75,7 +76,8 @@ def filmed(
             pixel = pixel + noise.normal(0.0, sigma, pixel.shape)
         covariance = np.where(item.valid[..., None, None], sigma**2 * np.eye(2), np.nan)
         found = View(camera, np.where(item.valid[..., None], pixel, np.nan), covariance, np.zeros(len(item.time)))
-        return replace(found, rotation=rotation, translation=translation) if moving else found
+        known = np.broadcast_to(np.diag(POSE_SIGMA**2), (len(rotation), 6, 6))
+        return replace(found, rotation=rotation, translation=translation, pose_covariance=known) if moving else found
 
     return replace(
         dataset,
