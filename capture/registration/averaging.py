@@ -84,17 +84,18 @@ def average_recording(recording: Recording, chosen: slice | NDArray[np.bool_]) -
     return position, np.broadcast_to(np.eye(3), (len(position), 3, 3)), sigma
 
 
-def measured_directions(recording: Recording) -> tuple[Array, Array, Array]:
-    """As `average_recording`, but of every frame: (T, M, 3), (T, M, 3, 3) and (T, M, 3)."""
-    position, shape = recording.position, recording.position.shape
+def measured_directions(recording: Recording, markers: slice) -> tuple[Array, Array, Array]:
+    """As `average_recording`, but of some markers in every frame: (T, M, 3), (T, M, 3, 3) and (T, M, 3)."""
+    position = recording.position[:, markers]
+    shape = position.shape
     if not recording.views:
-        return position, np.broadcast_to(np.eye(3), (*shape, 3)), recording.sigma
+        return position, np.broadcast_to(np.eye(3), (*shape, 3)), recording.sigma[:, markers]
     # The cameras are at rest, so that the markers of all frames can be those of one.
     views = {
         name: replace(
             view,
-            pixel=view.pixel.reshape(1, -1, 2),
-            covariance=view.covariance.reshape(1, -1, 2, 2),
+            pixel=view.pixel[:, markers].reshape(1, -1, 2),
+            covariance=view.covariance[:, markers].reshape(1, -1, 2, 2),
             lag=np.zeros(1),
         )
         for name, view in recording.views.items()

@@ -43,9 +43,10 @@ class Measured:
     @classmethod
     def of(cls, position: Array, sigma: Array, axes: Array | None = None) -> "Measured":
         """One set of markers, (M, 3), or K sets; measured along x, y and z if `axes` is None."""
-        shape = (-1, *position.shape[-2:])
         axes = np.broadcast_to(np.eye(3) if axes is None else axes, (*position.shape, 3))
-        return cls(position.reshape(shape), axes.reshape(*shape, 3), sigma.reshape(shape))
+        if position.ndim < 3:
+            return cls(position[None], axes[None], sigma[None])
+        return cls(position, axes, sigma)
 
     @property
     def seen(self) -> NDArray[np.bool_]:

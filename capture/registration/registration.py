@@ -134,9 +134,9 @@ def register(
     """
     own, names = len(specimen.layout.names), combined_layout(specimen)[0]
     clamp = specimen.clamp_layout.positions if rest is None else rest.clamp
-    position, axes, sigma = measured_directions(recording)
-    used = np.isfinite(clamp[:, 0]) & np.isfinite(position[:, own:, 0]).any(axis=0)
-    on_clamp = Measured.of(position, sigma, axes).select(slice(None), own + np.flatnonzero(used))
+    position, axes, sigma = measured_directions(recording, slice(own, None))
+    used = np.isfinite(clamp[:, 0]) & np.isfinite(position[..., 0]).any(axis=0)
+    on_clamp = Measured.of(position, sigma, axes).select(slice(None), used)
     if (on_clamp.seen.sum(axis=1) >= MIN_MARKERS).any():
         if not moving_clamp:
             position, axes, sigma = average_recording(recording, slice(None))

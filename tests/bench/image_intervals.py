@@ -128,7 +128,7 @@ def filmed_with_clamp(dataset: Dataset, cameras: list[OrthographicCamera], rando
             views[f"c{k}"] = View(own, pixel, covariance, np.zeros(FRAMES))
         sigma = np.full(points.shape, 1e-4)
         recording = Recording(None, item.time, points, sigma, None, True, "", views=views)
-        position, axes, sigma = (part[:, count:] for part in measured_directions(recording))
+        position, axes, sigma = measured_directions(recording, slice(count, None))
         pose, pose_covariance, _ = fit_poses(Measured.of(position, sigma, axes), CLAMP)
         moving = {"rotation": pose.rotation, "translation": pose.translation, "pose_covariance": pose_covariance}
         own_views = {key: replace(view.select_markers(np.arange(count)), **moving) for key, view in views.items()}
