@@ -171,6 +171,7 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
     views = {camera: grid.resample(view.select_frames(chosen)) for camera, view in item.views.items()}
     first = slice(start.frame, start.frame + 1)
     pose = initial.pose if registration.pose_from_model else registration.pose.select_frames(first)
+    covariance = registration.covariance if registration.covariance.ndim < 3 else registration.covariance[start.frame]
     residual = dataset.markers.positions(torch.from_numpy(initial.q)).numpy() - initial.pose.apply(frame.target)
     own = frame.along_axes(residual[frame.measured])
     residual[frame.measured] = np.where(frame.observed_axes, own, 0.0)
@@ -191,7 +192,7 @@ def _trajectory(dataset: Dataset, specimen: Specimen, item: Registered, settings
             "registration": registration.method,
             "registration_R": pose.rotation.reshape(-1, 3, 3)[0],
             "registration_t": pose.translation.reshape(-1, 3)[0],
-            "registration_covariance": registration.covariance,
+            "registration_covariance": covariance,
             "registration_residual_mm": 1e3 * max(registration.residual.values(), default=np.nan),
             "registration_markers": ", ".join(f"{k} {1e3 * v:.3f}" for k, v in registration.residual.items()),
             "registration_modulus": registration.modulus,
@@ -314,4 +315,5 @@ class _EvenGrid:
             self.fill(view.lag + self.late, 0.0),
             None if view.rotation is None else view.rotation[recorded],
             None if view.translation is None else view.translation[recorded],
+            None if view.pose_covariance is None else view.pose_covariance[recorded],
         )

@@ -18,8 +18,9 @@ from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.force_search import MODULUS_SIGMA
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError, SimulationError
+from rafl.data.camera_terms import CameraTerm
 from rafl.data.dataset import Dataset, Trajectory
-from rafl.data.objective import CameraTerm, Recordings
+from rafl.data.objective import Recordings
 from rafl.data.views import at_lags
 from rafl.fitting.gauss_newton import bounded_step
 from rafl.fitting.material_search import spread_by_size

@@ -8,18 +8,19 @@ from numpy.typing import NDArray
 
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
+from rafl.capture.registration.averaging import average_frames, average_views
 from rafl.capture.registration.camera_change import CameraChange, positions_at, without_lag
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.motion_start import MotionStart, find_motion_start
 from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.recording import Recording
-from rafl.capture.registration.registration import Registration, average_frames, fit_pose_near_clamp
+from rafl.capture.registration.registration import Registration, fit_pose_near_clamp
 from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, RigidTransform, pose_sigma
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.markers import Markers
-from rafl.data.views import View, seen_axes
+from rafl.data.views import View
 
 Array = NDArray[Any]
 
@@ -58,6 +59,8 @@ class Registered:
         own = len(specimen.layout.names)
         position = registration.pose.apply(recording.position[:, :own])
         sigma = registration.pose.rotate_sigma(recording.sigma[:, :own])
+        if registration.covariance.ndim > 2:
+            sigma = np.hypot(sigma, pose_sigma(registration.covariance[:, None], position))
         position[:, [name in registration.outliers for name in specimen.layout.names]] = np.nan
         # Positions as recorded: if a clamp marker jumps, a specimen at rest would seem to move in the clamp's frame.
         start = _motion_start(recording.position[:, :own], row, settings)
@@ -71,7 +74,7 @@ class Registered:
             [k if name not in registration.outliers else -1 for k, name in enumerate(specimen.layout.names)]
         )
         views = {camera: view.select_markers(kept) for camera, view in recording.views.items()}
-        views = _in_frame(views, registration.pose, recording.time)
+        views = _in_frame(views, registration.pose, registration.covariance, recording.time)
         return cls(recording, row, registration, position, sigma, start, last, views)
 
     def with_changes(self, changes: dict[str, CameraChange]) -> "Registered":
@@ -95,7 +98,7 @@ class Registered:
         position = places.pose.apply(self.position)
         by_pose = pose_sigma(places.pose_covariance, position)
         sigma = np.hypot(places.pose.rotate_sigma(self.sigma), by_pose)
-        views = _in_frame(self.views, places.pose, self.recording.time)
+        views = _in_frame(self.views, places.pose, places.pose_covariance, self.recording.time)
         return replace(self, registration=registration, position=position, sigma=sigma, views=views)
 
     def first_frame(self, dataset: Dataset, specimen: Specimen, whole_surface: bool) -> FirstFrame:
@@ -118,14 +121,18 @@ class Registered:
     def _views_without_lag(self) -> dict[str, View]:
         """What the cameras would have measured at the times of the frames: a specimen that moves has moved on since."""
         views = {name: without_lag(view, self.recording.time) for name, view in self.views.items()}
-        moving = self.registration.pose.rotation.ndim > 2
-        return _in_frame(views, self.registration.pose, self.recording.time) if moving else views
+        own = self.registration
+        moving = own.pose.rotation.ndim > 2
+        return _in_frame(views, own.pose, own.covariance, self.recording.time) if moving else views
 
 
-def _in_frame(views: dict[str, View], pose: RigidTransform, time: Array) -> dict[str, View]:
+def _in_frame(views: dict[str, View], pose: RigidTransform, covariance: Array, time: Array) -> dict[str, View]:
     """The views in the specimen frame, to which a pose leads from the cameras' frame: one, or one for every frame.
 
-    time: of the frames [s], (T).
+    Args:
+        views: by camera.
+        pose, covariance: the latter is contained in views whose pose differs from frame to frame.
+        time: of the frames [s], (T).
     """
     if pose is IDENTITY:
         return views
@@ -133,45 +140,12 @@ def _in_frame(views: dict[str, View], pose: RigidTransform, time: Array) -> dict
         result = {}
         for name, view in views.items():
             own = pose.at_times(time, time + view.lag) if view.lag.any() else pose
-            result[name] = replace(view, rotation=own.rotation, translation=own.translation)
+            result[name] = replace(view, rotation=own.rotation, translation=own.translation, pose_covariance=covariance)
         return result
     return {
         name: replace(view, camera=view.camera.in_frame(pose.rotation, pose.translation))
         for name, view in views.items()
     }
-
-
-def average_views(views: dict[str, View], near: Array) -> tuple[Array, Array, Array]:
-    """Positions that the cameras measured on average over some frames, and in which directions.
-
-    Args:
-        views: by camera.
-        near: positions about which the projection is linearised [m], (M, 3), NaN where not known.
-
-    Returns:
-        Positions [m], (M, 3), NaN where no camera saw the marker, and its measured directions as in
-        `rafl.data.views.seen_axes`. In directions that were not measured a position stays near the given one.
-    """
-    means = {}
-    for name, view in ((name, view.without_motion(near)) for name, view in views.items()):
-        known = np.isfinite(near[:, :1])
-        pixel, sigma = average_frames(view.pixel, np.sqrt(np.diagonal(view.covariance, axis1=-2, axis2=-1)))
-        seen = known & np.isfinite(sigma)
-        pixel, sigma = np.where(seen, pixel, np.nan), np.where(seen, sigma, np.nan)
-        means[name] = replace(
-            view, pixel=pixel[None], covariance=(sigma**2)[None, ..., None] * np.eye(2), lag=np.zeros(1)
-        )
-    axes, sigma = seen_axes(means, near)
-    target = np.where(np.isfinite(sigma[:, :1]), near, np.nan)
-    # One Gauss-Newton step towards the mean pixels, in the measured directions.
-    step = np.zeros_like(target)
-    for view in means.values():
-        seen = view.seen[0]
-        slope = view.jacobian(near[seen])[0]
-        gap = view.pixel[0, seen] - view.project(near[seen])[0]
-        step[seen] += (slope.swapaxes(1, 2) @ np.linalg.solve(view.covariance[0, seen], gap[..., None]))[..., 0]
-    along = np.where(np.isfinite(sigma), sigma, 0.0) ** 2 * (axes @ step[..., None])[..., 0]
-    return target + (axes.swapaxes(1, 2) @ along[..., None])[..., 0], axes, sigma
 
 
 def find_dataset_places(

@@ -1,6 +1,6 @@
 """Rigid transforms that put dots on the surface of a body, by the iterative closest point method."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -53,17 +53,18 @@ def align_with_surface(
     """
     pose, length = start, float(np.ptp(shape.mesh.vertices, axis=0).max())
     for _ in range(MAX_STEPS):
-        moved = pose.apply(dots.position)
-        gap, towards = _gaps(shape, q, replace(dots, position=moved))
-        arm = (moved - moved.mean(axis=0)) / length
+        moved = dots.moved(pose)
+        gap, towards = _gaps(shape, q, moved)
+        middle = moved.position.mean(axis=0)
+        arm = (moved.position - middle) / length
         jacobian = np.column_stack([np.cross(arm, towards), towards])
         step = np.linalg.lstsq(jacobian, -gap, rcond=least)[0]
-        centred = RigidTransform(pose.rotation, pose.translation - moved.mean(axis=0))
+        centred = RigidTransform(pose.rotation, pose.translation - middle)
         turned = centred.followed_by(np.concatenate([step[:3] / length, step[3:]]))
-        pose = RigidTransform(turned.rotation, turned.translation + moved.mean(axis=0))
+        pose = RigidTransform(turned.rotation, turned.translation + middle)
         if np.abs(step).max() < STEP_TOLERANCE:
             break
-    distance = float(np.sqrt(np.mean(_gaps(shape, q, replace(dots, position=pose.apply(dots.position)))[0] ** 2)))
+    distance = float(np.sqrt(np.mean(_gaps(shape, q, dots.moved(pose))[0] ** 2)))
     _, values, motions = np.linalg.svd(jacobian)
     values = np.where(values > least * values[0], values, 0.0)
     motion = np.cross(motions[:, None, :3], arm) + motions[:, None, 3:]  # of each dot, (6, M, 3)

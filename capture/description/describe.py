@@ -98,7 +98,7 @@ def describe(
     placed = recording.in_specimen_frame or _fits(shape, q, dots, modulus_sigma)
     if not placed:
         alignment = find_pose(shape, q, dots)
-        dots = replace(dots, position=alignment.pose.apply(dots.position))
+        dots = dots.moved(alignment.pose)
         if _fits(shape, q, dots, modulus_sigma):
             _check_pose(alignment, faces_of(carry_back(shape, q, dots).normal), label)
     dots = _dots_on_body(shape, q, dots, left_out, label, modulus_sigma)
@@ -106,7 +106,7 @@ def describe(
     if not placed:
         for _ in range(POSE_ITERATIONS):
             alignment = align_with_surface(shape, undeformed.q, dots)
-            dots = replace(dots, position=alignment.pose.apply(dots.position))
+            dots = dots.moved(alignment.pose)
             undeformed = find_undeformed(shape, simulator, dots, modulus_sigma, UNKNOWN_POSE_SIGMA)
         undeformed = replace(undeformed, sigma=np.hypot(undeformed.sigma, alignment.sigma))
     kept = _dots_on_body(shape, undeformed.q, dots, left_out, label)
@@ -145,8 +145,7 @@ def _check_lying(recording: Recording, body: Body, folder: Path, label: str, mod
 def _distances(shape: Shape, q: Array, dots: Dots, modulus_sigma: float) -> tuple[Array, Array]:
     """Distances of dots from the body, and the largest allowed ones, as an uncertain E bends it otherwise [m], (M)."""
     carried = carry_back(shape, q, dots)
-    sag = np.linalg.norm(dots.position - carried.gap - carried.rest, axis=1)
-    return carried.distance, MAX_DISTANCE + modulus_sigma * sag
+    return carried.distance, MAX_DISTANCE + modulus_sigma * carried.deflection
 
 
 def _fits(shape: Shape, q: Array, dots: Dots, modulus_sigma: float) -> bool:
@@ -189,13 +188,14 @@ def _dots_on_body(
 
 def _reason(shape: Shape, q: Array, dots: Dots) -> str:
     """Whether another place or another size of the body would put the dots on its faces, and what to do."""
+    dots = replace(dots, sigma=np.where(dots.measured, dots.sigma, PLACED_SIGMA))  # where the planes are
     middle = 0.5 * (q.min(axis=0) + q.max(axis=0) - dots.position.min(axis=0) - dots.position.max(axis=0))
     best: tuple[Array, RigidTransform] | None = None
     for shift in (np.zeros(3), *np.diag(middle)):  # along each axis, the middle of the dots to that of the body
         pose = align_with_surface(shape, q, dots, RigidTransform(np.eye(3), shift), HARDLY_TOLD).pose
-        moved = pose.apply(dots.position)
-        distance = carry_back(shape, q, replace(dots, position=moved)).distance
-        motion = moved - dots.position
+        moved = dots.moved(pose)
+        distance = carry_back(shape, q, moved).distance
+        motion = moved.position - dots.position
         if np.mean(distance > MAX_DISTANCE) <= MAX_LEFT_OUT and (
             best is None or np.linalg.norm(motion) < np.linalg.norm(best[0])
         ):

@@ -1,15 +1,15 @@
 """The dots of a recording at rest: their mean positions while nothing moves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.capture.registration.averaging import average_recording
 from rafl.capture.registration.recording import Recording
-from rafl.capture.registration.registration import average_frames
 from rafl.capture.registration.release import REST_NOISE_FACTOR, find_release
-from rafl.capture.registration.rigid import MIN_MARKERS
+from rafl.capture.registration.rigid import MIN_MARKERS, RigidTransform
 from rafl.common.errors import InputError
 
 Array = NDArray[Any]
@@ -24,17 +24,37 @@ class Dots:
     Attributes:
         names: in the file, or numbers from 1 where it has none, (M).
         position: [m], (M, 3).
-        sigma: standard deviations of the positions [m], (M, 3).
+        axes: unit vectors along which each dot was measured, the rows of (M, 3, 3). Where one camera saw it, the last
+            is the line of sight, away from the camera.
+        sigma: standard deviations of the positions along the axes [m], (M, 3); infinite where not measured.
     """
 
     names: tuple[str, ...]
     position: Array
+    axes: Array
     sigma: Array
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Along which axes each dot was measured, (M, 3)."""
+        return np.isfinite(self.sigma)
+
+    def precision(self, model_sigma: float = 0.0) -> Array:
+        """Inverse covariances of the positions [1/m^2], (M, 3, 3), of rank 2 where one camera saw the dot.
+
+        model_sigma: adds to the standard deviations [m].
+        """
+        scaled = self.axes / np.hypot(self.sigma, model_sigma)[..., None]
+        return np.asarray(scaled.swapaxes(1, 2) @ scaled)
 
     def select(self, chosen: NDArray[np.bool_]) -> "Dots":
         """The dots where `chosen` (M) is true."""
         names = tuple(name for name, kept in zip(self.names, chosen, strict=True) if kept)
-        return Dots(names, self.position[chosen], self.sigma[chosen])
+        return Dots(names, self.position[chosen], self.axes[chosen], self.sigma[chosen])
+
+    def moved(self, pose: RigidTransform) -> "Dots":
+        """The dots after a rigid motion."""
+        return replace(self, position=pose.apply(self.position), axes=self.axes @ pose.rotation.T)
 
 
 def dots_at_rest(recording: Recording, label: str) -> Dots:
@@ -53,9 +73,9 @@ def dots_at_rest(recording: Recording, label: str) -> Dots:
             f"{label}: expected a specimen that rests, found no rest in most of its {count} frames, nor before a "
             "release; film it again once it hangs still"
         )
-    position, sigma = average_frames(recording.position[frames], recording.sigma[frames])
+    position, axes, sigma = average_recording(recording, frames)
     names = recording.names or tuple(str(number + 1) for number in range(len(position)))
-    dots = Dots(names, position, sigma).select(np.isfinite(position[:, 0]))
+    dots = Dots(names, position, axes, sigma).select(np.isfinite(position[:, 0]))
     if len(dots.names) < MIN_MARKERS:
         raise InputError(
             f"{label}: expected at least {MIN_MARKERS} dots, found {len(dots.names)}; check that the tracks show the "

@@ -30,6 +30,8 @@ PLACED_SIGMA = (
 ROW_OFFSET_SIGMA = 0.1  # of the height of a row, which nobody knows beforehand [m]
 MAX_ROW_SCATTER = 3.0  # dots farther from straight rows than this multiple of PLACED_SIGMA were not placed in rows
 MIN_SIGMA = 5e-5  # of a place, for what the model does not know of the clamp and of Poisson's ratio [m]
+DEPTH_SHARE = 0.3  # standard deviation of an unmeasured depth, as a share of the body's size
+SURFACE_STEPS, LEAST_SLOPE = 8, 0.1  # along a line of sight to a surface, of which it must not be nearly a tangent
 MODULUS_STEP = 0.05  # of log E, for differences
 MODULUS_TOLERANCE = 1e-3  # the search ends with a smaller change of log E
 
@@ -49,9 +51,12 @@ class Carried:
     Attributes:
         rest: places on the undeformed body [m], (M, 3).
         normal: its outward normal there, (M, 3).
-        gap: from the nearest points of the deformed body to the dots [m], (M, 3).
+        gap: from the points of the deformed body to the dots, in the directions that were measured [m], (M, 3).
         direction: outward normal of the deformed body there, (M, 3).
-        distance: of the dots from the body [m], (M).
+        distance: of the dots from the body [m], (M). Where one camera saw a dot, it is that of its line of sight, or
+            that of its assumed position along the normal less the deflection there, if that is larger.
+        deflection: of the body there [m], (M).
+        sigma: standard deviation of the places on the body that follows from those of the dots [m], (M).
     """
 
     rest: Array
@@ -59,41 +64,83 @@ class Carried:
     gap: Array
     direction: Array
     distance: Array
+    deflection: Array
+    sigma: Array
 
     @property
     def offset(self) -> Array:
-        """Distances of the dots from the deformed body along its outward normal [m], (M)."""
+        """Distances of the dots from the deformed body along its outward normal, as far as measured [m], (M)."""
         return np.asarray((self.gap * self.direction).sum(axis=1))
 
 
 def carry_back(shape: Shape, q: Array, dots: Dots) -> Carried:
     """Carry dots back by the deformation of the surface point that is nearest to each, in units of the dot's sigma.
 
+    Where one camera saw a dot, it is the point in which the line of sight meets the body first.
+
     Args:
         shape: of the undeformed body.
         q: its nodes as it is deformed [m], (N, 3).
         dots: as recorded.
     """
-    mesh, count = shape.mesh, len(dots.names)
-    model_sigma = _model_sigma(np.linalg.norm(q - mesh.vertices, axis=1).max())
-    sigma = np.exp(np.round(np.log(np.hypot(dots.sigma, model_sigma)), 1))  # dots of similar ones are embedded together
-    quad, weights = np.zeros((count, 4), dtype=np.int64), np.zeros((count, 4))
-    for unit in np.unique(sigma, axis=0):
-        own = np.flatnonzero((sigma == unit).all(axis=1))
-        found = embed(HexMesh(q / unit, mesh.hexes), ("",) * len(own), dots.position[own] / unit)
-        quad[own], weights[own] = found.quad, found.weights
+    mesh = shape.mesh
+    quad, weights = _nearest_points(mesh, q, dots)
     markers = Markers(dots.names, dots.position, quad, weights, np.zeros(len(quad)))
     deformed, undeformed = torch.from_numpy(q), torch.from_numpy(mesh.vertices)
     axes, rest_axes = markers.axes(deformed).numpy(), markers.axes(undeformed).numpy()
-    gap = dots.position - markers.positions(deformed).numpy()
+    point = markers.positions(deformed).numpy()
+    along = dots.axes @ (dots.position - point)[..., None]
+    gap = (dots.axes.swapaxes(1, 2) @ np.where(dots.measured[..., None], along, 0.0))[..., 0]
     rest, normal = markers.positions(undeformed).numpy(), rest_axes[..., 2]
+    deflection = np.linalg.norm(point - rest, axis=1)
     distance = np.linalg.norm(gap, axis=1)
     if shape.surface is not None:
-        rest = rest + np.einsum("mij,mjk,mk->mi", rest_axes, np.linalg.inv(axes), gap)
-        query = trimesh.proximity.ProximityQuery(shape.surface)  # type: ignore[no-untyped-call]
-        nearest, distance, triangle = query.on_surface(1e3 * rest)
-        rest, distance, normal = 1e-3 * nearest, 1e-3 * distance, shape.surface.face_normals[triangle]
-    return Carried(rest, normal, gap, axes[..., 2], distance)
+        back = rest_axes @ np.linalg.inv(axes)
+        sight = np.where(dots.measured[:, 2:], 0.0, (back @ dots.axes[:, 2, :, None])[..., 0])
+        rest, distance, normal = _on_surface(shape.surface, rest + (back @ gap[..., None])[..., 0], sight)
+    depth = np.abs(((dots.position - point - gap) * axes[..., 2]).sum(axis=1))
+    distance = np.maximum(distance, depth - deflection)
+    # Where a dot must lie on the surface, what was measured decides along the two tangents only.
+    tangents, rest_tangents = axes[..., :2], rest_axes[..., :2]
+    unknown = np.eye(3) / np.ptp(q, axis=0).max() ** 2  # along a face that is seen edge-on
+    by_tangent = tangents.swapaxes(1, 2) @ (dots.precision() + unknown) @ tangents
+    covariance = rest_tangents @ np.linalg.inv(by_tangent) @ rest_tangents.swapaxes(1, 2)
+    sigma = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
+    return Carried(rest, normal, gap, axes[..., 2], distance, deflection, sigma)
+
+
+def _nearest_points(mesh: HexMesh, q: Array, dots: Dots) -> tuple[NDArray[np.int64], Array]:
+    """Boundary quads (M, 4) of the deformed body, and weights of their nodes, of the points nearest to the dots."""
+    size = float(np.linalg.norm(np.ptp(q, axis=0)))
+    model_sigma = _model_sigma(np.linalg.norm(q - mesh.vertices, axis=1).max())
+    # A dot of unknown depth starts in front of the body, so that the face towards the camera is the nearest.
+    position = dots.position - size * np.where(dots.measured[:, 2:], 0.0, dots.axes[:, 2])
+    sigma = np.where(dots.measured, np.exp(np.round(np.log(np.hypot(dots.sigma, model_sigma)), 1)), DEPTH_SHARE * size)
+    precision = replace(dots, sigma=sigma).precision()
+    quad, weights = np.zeros((len(position), 4), dtype=np.int64), np.zeros((len(position), 4))
+    _, group = np.unique(np.round(precision * model_sigma**2, 9), axis=0, return_inverse=True)
+    for number in range(group.max() + 1):  # dots of similar uncertainty are embedded together
+        own = np.flatnonzero(group.ravel() == number)
+        scaled = np.linalg.cholesky(precision[own[0]])
+        found = embed(HexMesh(q @ scaled, mesh.hexes), ("",) * len(own), position[own] @ scaled)
+        quad[own], weights[own] = found.quad, found.weights
+    return quad, weights
+
+
+def _on_surface(surface: trimesh.Trimesh, points: Array, sight: Array) -> tuple[Array, Array, Array]:
+    """Points of a surface [mm] nearest to points (M, 3) [m], their distances [m], and the normals there.
+
+    sight: of points that may move along a line to the surface, its direction, else 0, (M, 3).
+    """
+    query = trimesh.proximity.ProximityQuery(surface)  # type: ignore[no-untyped-call]
+    for _ in range(SURFACE_STEPS if sight.any() else 1):
+        nearest, distance, triangle = query.on_surface(1e3 * points)
+        normal = surface.face_normals[triangle]
+        slope = (normal * sight).sum(axis=1)
+        towards = (normal * (1e-3 * nearest - points)).sum(axis=1)
+        step = np.where(np.abs(slope) > LEAST_SLOPE, towards / np.where(slope == 0.0, 1.0, slope), 0.0)
+        points = points + step[:, None] * sight
+    return 1e-3 * nearest, 1e-3 * distance, normal
 
 
 def _model_sigma(deflection: Any) -> Any:
@@ -133,7 +180,7 @@ def find_undeformed(
     on its faces. E is the most probable value, by Gauss-Newton, of these observations:
 
     - a dot's position across its row, which is off the row's by PLACED_SIGMA;
-    - a dot's distance from its face, which is off zero by its sigma;
+    - a dot's distance from its face as far as it was measured, which is off zero by its sigma;
     - both also by a height and a tilt of the body in its world, each of `world_sigma` at the tip;
     - log E, which is off that of the assumed material by `prior_sigma`.
 
@@ -155,10 +202,8 @@ def find_undeformed(
         log_modulus, sigma, _ = search.minimise(with_rows=False)
     q, carried = search.at(log_modulus)
     slope = (search.at(log_modulus + MODULUS_STEP)[1].rest - carried.rest) / MODULUS_STEP
-    in_plane = [np.array(GRID_DIRECTIONS[face[0]]) for face in faces_of(carried.normal)]
-    measured = np.linalg.norm(np.array(in_plane) * dots.sigma[:, None], axis=2).max(axis=1)
-    model = _model_sigma(np.linalg.norm(dots.position - carried.rest, axis=1))
-    place_sigma = np.sqrt(MIN_SIGMA**2 + measured**2 + model**2 + (sigma * np.linalg.norm(slope, axis=1)) ** 2)
+    model = _model_sigma(carried.deflection)
+    place_sigma = np.sqrt(MIN_SIGMA**2 + carried.sigma**2 + model**2 + (sigma * np.linalg.norm(slope, axis=1)) ** 2)
     return Undeformed(carried, place_sigma, q, log_modulus, sigma)
 
 
@@ -210,9 +255,10 @@ class _ModulusSearch:
         across = np.array([GRID_DIRECTIONS[faces[dot][0]][1] for dot in order]).reshape(-1, 3)
         position = (carried.rest[order] * across).sum(axis=1)
         number = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
-        model = _model_sigma(np.linalg.norm(self.dots.position - base.rest, axis=1))
-        off_face = np.sqrt((base.direction**2 * self.dots.sigma**2).sum(axis=1) + model**2)
-        variance = np.concatenate([np.hypot(PLACED_SIGMA, self.dots.sigma[order].min(axis=1)), off_face]) ** 2
+        model = _model_sigma(base.deflection)
+        along = (self.dots.axes @ base.direction[..., None])[..., 0]
+        own_variance = (along**2 * np.where(self.dots.measured, self.dots.sigma, 0.0) ** 2).sum(axis=1)
+        variance = np.concatenate([PLACED_SIGMA**2 + base.sigma[order] ** 2, own_variance + model**2])
         height = np.concatenate([across @ up, base.direction @ up])
         tilt = height * np.concatenate([reach[order], reach]) / reach.max()
         covariance = np.diag(variance) + self.world_sigma**2 * (np.outer(height, height) + np.outer(tilt, tilt))

@@ -8,8 +8,9 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import FirstFrame, rigid_modes
-from rafl.capture.registration.rigid import RigidTransform, kabsch, pose_jacobian
+from rafl.capture.registration.rigid import RigidTransform, kabsch
 from rafl.common.errors import SimulationError
+from rafl.data.views import pose_jacobian
 
 Array = NDArray[Any]
 

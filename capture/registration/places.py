@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.force_search import MODULUS_SIGMA, modulus_slope
 from rafl.capture.registration.initial import ResultantFit, fit_resultant, resultant_jacobian
-from rafl.capture.registration.rigid import RigidTransform, pose_jacobian
+from rafl.capture.registration.rigid import RigidTransform
 from rafl.data.markers import Markers, embed
+from rafl.data.views import pose_jacobian
 
 Array = NDArray[Any]
 

@@ -6,23 +6,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.capture.registration.averaging import average_recording, measured_directions
+from rafl.capture.registration.pose_fit import Measured, RigidFit, fit_pose, fit_poses
 from rafl.capture.registration.recording import Recording
-from rafl.capture.registration.rigid import (
-    IDENTITY,
-    MIN_MARKERS,
-    RigidFit,
-    RigidTransform,
-    fit_clamp_poses,
-    fit_pose,
-    kabsch,
-)
+from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, RigidTransform, kabsch
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import THROUGH_MODEL
 
 Array = NDArray[Any]
 
-UNOBSERVED_SIGMA = 1.0  # [m], assumed for a coordinate that was not observed
 # Assumed bending of the marker farthest from the clamp, as a fraction of its distance; it grows quadratically.
 BENDING_FRACTION = 0.3
 
@@ -45,7 +38,7 @@ class Registration:
         pose: one transform, or one for every frame.
         residual: distance of the markers used from their layout positions [m], by name.
         outliers: names of markers that are left out.
-        covariance: of the pose, (6, 6), as in `RigidFit`; NaN if unknown.
+        covariance: of the pose, as in `RigidFit`, (6, 6), or of that of every frame, (T, 6, 6); NaN if unknown.
         pose_from_model: whether the pose is still unknown and must be found from deformed shapes.
         modulus: E that was found with the pose [Pa]; NaN if it was not.
         modulus_sigma: standard deviation of its logarithm.
@@ -93,45 +86,26 @@ def fit_rest(recording: Recording, rest_pose: RestPose, specimen: Specimen, tole
             f"--rest {rest_pose.recording}: expected frames within 0 to {count - 1}, found {first} to {last}; "
             "correct them"
         )
-    position, sigma = average_frames(recording.position[first : last + 1], recording.sigma[first : last + 1])
-    fit = _fit_within_tolerance(position, sigma, specimen, tolerance, f"--rest {rest_pose.recording}")
-    return RestFit(fit, fit.transform.apply(position)[len(specimen.layout.names) :])
+    position, axes, sigma = average_recording(recording, slice(first, last + 1))
+    measured = Measured.of(position, sigma, axes)
+    fit = _fit_within_tolerance(measured, specimen, tolerance, f"--rest {rest_pose.recording}")
+    # A clamp marker is where it was measured, and where the layout has it along a line of sight.
+    layout = combined_layout(specimen)[1]
+    gap = (axes.swapaxes(1, 2) @ measured.gaps(fit.transform, layout)[0, ..., None])[..., 0]
+    places = np.where(measured.seen[0, :, None], layout + gap @ fit.transform.rotation.T, np.nan)
+    return RestFit(fit, places[len(specimen.layout.names) :])
 
 
-def average_frames(position: Array, sigma: Array) -> tuple[Array, Array]:
-    """Weighted mean over frames and its sigma [m], (M, 3).
-
-    Averaging reduces only the part of the variance that is seen as scatter between the frames; the rest of sigma is
-    systematic and stays.
-
-    Args:
-        position, sigma: [m], (T, M, 3), NaN where missing.
-
-    Returns:
-        Mean, NaN for markers that are missing in all frames, and sigma, infinite for these.
-    """
-    sigma = np.where(np.isfinite(sigma), sigma, UNOBSERVED_SIGMA)
-    measured = np.isfinite(position[..., :1])
-    weight = np.where(measured, 1.0 / np.where(measured, sigma, 1.0) ** 2, 0.0)
-    total, count = weight.sum(axis=0), measured.sum(axis=0)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (weight * np.where(measured, position, 0.0)).sum(axis=0) / total
-        variance = count / total  # of one frame
-        scatter = np.where(measured, (position - mean) ** 2, 0.0).sum(axis=0) / np.maximum(count - 1, 1)
-        white = np.minimum(scatter, variance)
-        return mean, np.where(total > 0, np.sqrt(variance - white + white / count), np.inf)
-
-
-def _fit_within_tolerance(position: Array, sigma: Array, specimen: Specimen, tolerance: float, label: str) -> RigidFit:
-    """Fit the pose to markers (M, 3) in the order of `combined_layout`; `label` begins error messages."""
+def _fit_within_tolerance(measured: Measured, specimen: Specimen, tolerance: float, label: str) -> RigidFit:
+    """Fit the pose to markers in the order of `combined_layout`; `label` begins error messages."""
     names, layout = combined_layout(specimen)
-    measured = int(np.isfinite(position[:, 0]).sum())
-    if measured < MIN_MARKERS:
+    visible = int(measured.seen.sum())
+    if visible < MIN_MARKERS:
         raise InputError(
-            f"{label}: expected at least {MIN_MARKERS} visible markers for registration, found {measured}; choose "
+            f"{label}: expected at least {MIN_MARKERS} visible markers for registration, found {visible}; choose "
             "other frames"
         )
-    fit = fit_pose(position, layout, sigma)
+    fit = fit_pose(measured, layout)
     if fit.rms_residual > tolerance:
         worst = names[int(np.nanargmax(fit.residual))]
         raise InputError(
@@ -160,12 +134,14 @@ def register(
     """
     own, names = len(specimen.layout.names), combined_layout(specimen)[0]
     clamp = specimen.clamp_layout.positions if rest is None else rest.clamp
-    used = np.isfinite(clamp[:, 0]) & np.isfinite(recording.position[:, own:, 0]).any(axis=0)
-    on_clamp, sigma = recording.position[:, own:][:, used], recording.sigma[:, own:][:, used]
-    if (np.isfinite(on_clamp[..., 0]).sum(axis=1) >= MIN_MARKERS).any():
+    position, axes, sigma = measured_directions(recording, slice(own, None))
+    used = np.isfinite(clamp[:, 0]) & np.isfinite(position[..., 0]).any(axis=0)
+    on_clamp = Measured.of(position, sigma, axes).select(slice(None), used)
+    if (on_clamp.seen.sum(axis=1) >= MIN_MARKERS).any():
         if not moving_clamp:
-            on_clamp, sigma = (part[None] for part in average_frames(on_clamp, sigma))
-        pose, distance = fit_clamp_poses(on_clamp, clamp[used], sigma)
+            position, axes, sigma = average_recording(recording, slice(None))
+            on_clamp = Measured.of(position, sigma, axes).select(slice(None), own + np.flatnonzero(used))
+        pose, covariance, distance = fit_poses(on_clamp, clamp[used])
         rms_by_marker = np.sqrt(np.nanmean(distance**2, axis=0))
         worst = float(rms_by_marker.max())
         if worst > tolerance:
@@ -173,14 +149,15 @@ def register(
                 f"recording {name}: expected the clamp markers at their layout positions, found them "
                 f"{1e3 * worst:.2f} mm off; check the clamp's at_mm, or allow it with --fit-tolerance-mm"
             )
-        pose = pose if moving_clamp else RigidTransform(pose.rotation[0], pose.translation[0])
-        used_names = np.array(names[own:])[used]
-        return Registration("clamp markers", pose, dict(zip(used_names, rms_by_marker.tolist(), strict=True)))
+        if not moving_clamp:
+            pose, covariance = RigidTransform(pose.rotation[0], pose.translation[0]), covariance[0]
+        residual = dict(zip(np.array(names[own:])[used], rms_by_marker.tolist(), strict=True))
+        return Registration("clamp markers", pose, residual, covariance=covariance)
     fit = rest.fit if rest is not None else None
     method = "rest pose" if rest is not None else "the file's own rest pose"
     if fit is None and recording.rest is not None:
-        sigma = np.full_like(recording.rest, float(np.nanmedian(recording.sigma)))
-        fit = _fit_within_tolerance(recording.rest, sigma, specimen, tolerance, f"recording {name}, rest pose")
+        measured = Measured.of(recording.rest, np.full_like(recording.rest, float(np.nanmedian(recording.sigma))))
+        fit = _fit_within_tolerance(measured, specimen, tolerance, f"recording {name}, rest pose")
     if fit is not None:
         residual = {names[k]: float(fit.residual[k]) for k in np.flatnonzero(np.isfinite(fit.residual))}
         outliers = tuple(names[k] for k in np.flatnonzero(fit.outliers))

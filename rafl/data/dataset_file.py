@@ -37,7 +37,7 @@ from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-FORMAT = "rafl-dataset/3"  # 2: with views; 3: also of a moving clamp
+FORMAT = "rafl-dataset/4"  # 2: with views; 3: also of a moving clamp; 4: with the covariance of its poses
 UNITS = "SI: m, s, kg, N, Pa; specimen frame: origin at a corner of the clamped face, x to the tip, z up"
 SPECIMEN_GROUPS = ("mesh", "material", "markers")  # groups that all recordings share
 HASH_ATTRIBUTE = "sha256"
@@ -68,6 +68,7 @@ UNITS_AND_FRAMES = {
     "lag": ("s", "from the row's time on"),
     "rotation": ("1", "calibration to specimen, when the camera measured"),
     "translation": ("m", "specimen"),
+    "pose_covariance": ("rad, m", "specimen; of a rotation and a translation applied after these"),
 }
 
 

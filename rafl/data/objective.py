@@ -12,78 +12,27 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from rafl.calibration.camera import Camera
 from rafl.common.errors import InputError
-from rafl.data.dataset import Dataset, Trajectory
-from rafl.data.views import MIN_ANGLE, View, at_lags, leave_moving_frame, project, project_slope
+from rafl.data.camera_terms import (
+    MIN_RELATIVE_SIGMA,
+    CameraTerm,
+    camera_terms,
+    reference_sigma,
+    without_pose_errors,
+)
+from rafl.data.dataset import Dataset
+from rafl.data.views import MIN_ANGLE, at_lags
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.rollout import ResidualForce, rollout
 from rafl.simulation.simulator import Simulator
 
 LOSS_SCALE = 1e3
-MIN_RELATIVE_SIGMA = 0.2  # of the median sigma: limits a weight to 25 times the usual one
 # In the image plane a residual beyond this share of the recording's motion (root mean square) counts linearly, no
 # longer squared (Huber's loss): a marker that took its neighbour's dot does not decide the fit.
 HUBER_SHARE = 0.5
-SAME_INSTANT = 1e-6  # of times that rounding explains [frames]
 MIN_HUBER_SIGMAS = 10.0  # the same limit is at least so many reference sigmas, for bodies that hardly move
 
 Objective = Literal["", "image", "3d"]  # empty: in the image plane where a dataset has views
-
-
-@dataclass(frozen=True)
-class CameraTerm:
-    """What one camera measured of B recordings, padded to the longest.
-
-    Attributes:
-        cameras: of each recording, (B), as in `View`.
-        pixel: (T, B, M, 2) [px], zero where not seen.
-        root: inverse square root of the pixels' covariances times the dataset's reference sigma [m/px], (T, B, M, 2,
-            2), zero where not seen. It turns a difference of pixels into a distance in the body.
-        lag: of the measurements [time steps], (T, B).
-        scale: of the image at the markers [px/m], (T, B, M); 1 where not seen.
-        rotation, translation: of the specimen frame, as in `View`, (T, B, 3, 3) and [m], (T, B, 3); those of the
-            identity where it is at rest.
-    """
-
-    cameras: list[Camera]
-    pixel: Tensor
-    root: Tensor
-    lag: Tensor
-    scale: Tensor
-    rotation: Tensor
-    translation: Tensor
-
-    @property
-    def seen(self) -> Tensor:
-        """1 where the camera saw a marker, else 0, (T, B, M)."""
-        return (self.root[..., 0, 0] != 0.0).to(self.pixel.dtype)
-
-    def index(self, frames: slice, recordings: list[int] | slice, markers: NDArray[np.int64] | slice) -> "CameraTerm":
-        """The measurements of some frames, recordings and markers."""
-        by_frame = {key: getattr(self, key)[frames][:, recordings] for key in ("lag", "rotation", "translation")}
-        chosen = {key: getattr(self, key)[frames][:, recordings][:, :, markers] for key in ("pixel", "root", "scale")}
-        cameras = self.cameras[recordings] if isinstance(recordings, slice) else [self.cameras[b] for b in recordings]
-        return CameraTerm(cameras, **by_frame, **chosen)
-
-    def up_to(self, frames: NDArray[np.int64]) -> "CameraTerm":
-        """Without measurements later than the last of some leading frames of each recording, (B).
-
-        A simulation that ends there does not show them.
-        """
-        time = torch.arange(len(self.lag), dtype=self.lag.dtype)[:, None] + self.lag
-        within = time <= torch.from_numpy(frames - 1.0 + SAME_INSTANT)
-        return replace(self, root=torch.where(within[..., None, None, None], self.root, 0.0))
-
-    def gap(self, markers: Tensor) -> Tensor:
-        """Simulated minus measured pixels, (T, B, M, 2), of simulated markers (T, B, M, 3) [m]."""
-        measured = at_lags(markers, self.lag)
-        return project(leave_moving_frame(measured, self.rotation, self.translation), self.cameras) - self.pixel
-
-    def slope(self, markers: Tensor) -> Tensor:
-        """Derivatives of the pixels by the markers when the camera measured [px/m], (T, B, M, 2, 3)."""
-        at_rest = leave_moving_frame(markers, self.rotation, self.translation)
-        return project_slope(at_rest, self.cameras) @ self.rotation.mT[:, :, None]
 
 
 @dataclass(frozen=True)
@@ -146,12 +95,12 @@ class Recordings:
         found = cls(dataset, names, stacked[0], stacked[1], stacked[2], {}, infinite)
         if not with_pixels:
             return found
-        reference = _reference_sigma(dataset)
+        reference = reference_sigma(dataset)
         least = torch.tensor((MIN_HUBER_SIGMAS * reference) ** 2, dtype=torch.float64)
         limit = torch.maximum(HUBER_SHARE**2 * torch.from_numpy(found.square_motion), least)
         return replace(
             found,
-            terms=_camera_terms(dataset, items, frames, reference),
+            terms=camera_terms(dataset, items, frames, reference),
             limit=infinite if objective == "3d" else limit,
         )
 
@@ -239,7 +188,8 @@ class Recordings:
         """
         if not self.in_image:
             return [(simulated - self.markers) * self.weight.sqrt()]
-        return [(term.root @ term.gap(simulated)[..., None])[..., 0] for term in self.terms.values()]
+        terms = list(self.terms.values())
+        return without_pose_errors(terms, [(term.root @ term.gap(simulated)[..., None])[..., 0] for term in terms])
 
     def gap_slopes(self, simulated: Tensor, slope: Tensor) -> list[Tensor]:
         """Derivatives of `gaps` in some directions, (T, n, B, M, D) each; slope of the markers (T, n, B, M, 3)."""
@@ -250,7 +200,7 @@ class Recordings:
             own = torch.stack([at_lags(slope[:, k], term.lag) for k in range(slope.shape[1])], dim=1)
             change = term.slope(at_lags(simulated, term.lag))[:, None] @ own[..., None]
             result.append((term.root[:, None] @ change)[..., 0])
-        return result
+        return without_pose_errors(list(self.terms.values()), result)
 
     def seen_directions(self, frame: int) -> Tensor:
         """Projections (B, M, 3, 3) onto the directions in which a frame's markers were measured; zero if in none."""
@@ -271,65 +221,6 @@ def _median_sigma(dataset: Dataset) -> float:
     """Median over all observed coordinates of a dataset [m]."""
     sigma = np.concatenate([item.sigma[item.valid].ravel() for item in dataset.trajectories.values()])
     return float(np.median(sigma[np.isfinite(sigma)]))
-
-
-def _image_sigma(view: View) -> NDArray[np.float64]:
-    """Standard deviation of a pixel, the geometric mean of both directions [px], (T, M); NaN where not seen."""
-    with np.errstate(invalid="ignore"):
-        sigma: NDArray[np.float64] = np.linalg.det(view.covariance) ** 0.25
-    return sigma
-
-
-def _reference_sigma(dataset: Dataset) -> float:
-    """Median over a dataset of the pixels' sigmas, as distances in the body [m]."""
-    sigmas = [
-        (_image_sigma(view) / view.scale(_known(item)))[view.seen]
-        for item in dataset.trajectories.values()
-        for view in item.views.values()
-    ]
-    return float(np.median(np.concatenate(sigmas)))
-
-
-def _camera_terms(dataset: Dataset, items: list[Trajectory], frames: int, reference: float) -> dict[str, CameraTerm]:
-    """What the cameras measured of some recordings, by camera; `reference` as `_reference_sigma`.
-
-    A camera that did not film a recording saw nothing of it. A sigma of less than a fifth of the reference counts as
-    that.
-    """
-    count = len(dataset.markers.names)
-    result = {}
-    for name in dict.fromkeys(name for item in items for name in item.views):
-        pixel, root = np.zeros((frames, len(items), count, 2)), np.zeros((frames, len(items), count, 2, 2))
-        lag, scale = np.zeros((frames, len(items))), np.ones((frames, len(items), count))
-        rotation = np.broadcast_to(np.eye(3), (frames, len(items), 3, 3)).copy()
-        translation, cameras = np.zeros((frames, len(items), 3)), []
-        for b, item in enumerate(items):
-            view = item.views.get(name)
-            cameras.append(next(iter(item.views.values())).camera if view is None else view.camera)
-            if view is None:
-                continue
-            length, seen = len(item.time), view.seen
-            own = view.scale(_known(item))
-            least = (MIN_RELATIVE_SIGMA * reference * own) ** 2
-            values, vectors = np.linalg.eigh(np.where(seen[..., None, None], view.covariance, np.eye(2)))
-            inverse = reference / np.sqrt(np.maximum(values, least[..., None]))
-            whitening = (vectors * inverse[..., None, :]) @ vectors.swapaxes(-1, -2)
-            root[:length, b] = np.where(seen[..., None, None], whitening, 0.0)
-            pixel[:length, b] = np.where(seen[..., None], view.pixel, 0.0)
-            lag[:length, b] = view.lag / dataset.simulator.time_step
-            scale[:length, b] = own
-            if view.rotation is not None:
-                rotation[:length, b], translation[:length, b] = view.rotation, view.translation
-        arrays = pixel, root, lag, scale, rotation, translation
-        term = CameraTerm(cameras, *(torch.from_numpy(array) for array in arrays))
-        result[name] = term.up_to(np.array([len(item.time) for item in items]))
-    return result
-
-
-def _known(item: Trajectory) -> NDArray[np.float64]:
-    """Positions (T, M, 3) [m]; the mean of the known ones where one is not known."""
-    middle = item.markers[item.valid].mean(axis=0)
-    return np.where(item.valid[..., None], item.markers, middle)
 
 
 def training_loss(recordings: Recordings, simulated: Tensor, forces: Tensor, force_penalty: float = 0.0) -> Tensor:

@@ -24,6 +24,7 @@ VIEW_ARRAYS = {
     "lag": ArrayFormat(("T",)),
     "rotation": ArrayFormat(("T", 3, 3), optional=True),
     "translation": ArrayFormat(("T", 3), optional=True),
+    "pose_covariance": ArrayFormat(("T", 6, 6), optional=True),
 }
 MAX_ROTATION_ERROR = 1e-6  # of the elements of R^T R - 1
 # What measurements of a camera can be; others are damage.
@@ -43,6 +44,8 @@ class View:
         lag: time at which this camera measured minus that of the recording's frame [s], (T).
         rotation, translation: of a moving specimen frame when this camera measured: a point X in the frame at rest has
             the coordinates R X + t in it, (T, 3, 3) and [m], (T, 3); None if the specimen frame is at rest.
+        pose_covariance: of a rotation vector and a translation applied after R and t [rad, m], (T, 6, 6), whose errors
+            differ from frame to frame and are those of all cameras; None if they are exactly known.
     """
 
     camera: Camera
@@ -51,12 +54,19 @@ class View:
     lag: Array
     rotation: Array | None = None
     translation: Array | None = None
+    pose_covariance: Array | None = None
 
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Which markers the camera saw, (T, M)."""
         seen: NDArray[np.bool_] = np.isfinite(self.pixel[..., 0])
         return seen
+
+    @property
+    def viewing_directions(self) -> Array:
+        """Lines of sight at the image centre: unit vectors away from the camera in the specimen frame, (T or 1, 3)."""
+        direction = self.camera.viewing_direction[None]
+        return direction if self.rotation is None else np.asarray((self.rotation @ direction[..., None])[..., 0])
 
     def select_markers(self, chosen: NDArray[np.int64]) -> "View":
         """The measurements of the given markers; NaN for the index -1."""
@@ -65,7 +75,7 @@ class View:
         pixel[:, gone], covariance[:, gone] = np.nan, np.nan
         return replace(self, pixel=pixel, covariance=covariance)
 
-    def select_frames(self, chosen: slice) -> "View":
+    def select_frames(self, chosen: slice | NDArray[np.bool_]) -> "View":
         """The measurements in some frames."""
         arrays: dict[str, Any] = {key: getattr(self, key) for key in VIEW_ARRAYS if getattr(self, key) is not None}
         return replace(self, **{key: array[chosen] for key, array in arrays.items()})
@@ -79,6 +89,11 @@ class View:
         slope = self.camera.jacobian(self._at_rest(points))
         return slope if self.rotation is None else slope @ self.rotation.swapaxes(1, 2)[:, None]
 
+    def pose_slope(self, points: Array) -> Array:
+        """Derivatives of `project` by a turn and a shift of the specimen frame [px/rad, px/m], (T, M, 2, 6)."""
+        slope: Array = -self.jacobian(points) @ pose_jacobian(points)
+        return slope
+
     def _at_rest(self, points: Array) -> Array:
         """Points (T, M, 3) in the camera's frame."""
         if self.rotation is None or self.translation is None:
@@ -89,13 +104,19 @@ class View:
     def without_motion(self, near: Array) -> "View":
         """The view as if the specimen frame had stayed where it was in the first frame.
 
+        The errors of its pose become errors of the pixels.
+
         near: positions [m], (M, 3), for which the pixels are exact; elsewhere to first order.
         """
         if self.rotation is None or self.translation is None:
             return self
         camera = self.camera.in_frame(self.rotation[0], self.translation[0])
-        pixel = self.pixel + (camera.project(near) - self.project(near))
-        return replace(self, camera=camera, pixel=pixel, rotation=None, translation=None)
+        pixel, covariance = self.pixel + (camera.project(near) - self.project(near)), self.covariance
+        if self.pose_covariance is not None:
+            slope = self.pose_slope(near)
+            covariance = covariance + slope @ self.pose_covariance[:, None] @ slope.swapaxes(-1, -2)
+        still = replace(self, rotation=None, translation=None, pose_covariance=None)
+        return replace(still, camera=camera, pixel=pixel, covariance=covariance)
 
     def scale(self, points: Array) -> Array:
         """Scale of the image at points (T, M, 3) [px/m], the geometric mean of both directions, (T, M)."""
@@ -130,6 +151,12 @@ class View:
             error = np.abs(self.rotation.swapaxes(1, 2) @ self.rotation - np.eye(3)).max(initial=0.0)
             if error > MAX_ROTATION_ERROR or (np.linalg.det(self.rotation) < 0.0).any():
                 raise ValueError(f"{label}/rotation: expected rotation matrices")
+        if self.pose_covariance is not None:
+            own = self.pose_covariance
+            if self.rotation is None or not np.allclose(own, own.swapaxes(1, 2), rtol=1e-6, atol=0.0):
+                raise ValueError(f"{label}/pose_covariance: expected symmetric matrices of a moving frame's poses")
+            if not (np.linalg.eigvalsh(own) >= 0.0).all():
+                raise ValueError(f"{label}/pose_covariance: expected positive definite matrices")
         self._check_camera(label, positions)
 
     def _check_camera(self, label: str, positions: Array) -> None:
@@ -150,6 +177,12 @@ class View:
             )
 
 
+def pose_jacobian(points: Array) -> Array:
+    """Derivatives of transformed points (..., 3) by a rotation vector and a translation afterwards, (..., 3, 6)."""
+    rotation = np.cross(np.eye(3), points[..., None, :]).swapaxes(-1, -2)
+    return np.concatenate([rotation, np.broadcast_to(np.eye(3), rotation.shape)], axis=-1)
+
+
 def leave_moving_frame(points: Any, rotation: Any, translation: Any) -> Any:
     """Points (.., M, 3) of a moving frame in the frame at rest, from which R X + t leads to it. Arrays or tensors.
 
@@ -167,15 +200,17 @@ def seen_axes(views: Mapping[str, View], position: Array) -> tuple[Array, Array]
 
     Returns:
         Orthonormal rows for every marker, (M, 3, 3), and the sigma along each [m], (M, 3), largest last; infinite where
-        no camera measured.
+        no camera measured. The last row points away from the cameras.
     """
-    information = np.zeros((len(position), 3, 3))
+    information, away = np.zeros((len(position), 3, 3)), np.zeros_like(position)
     for view in views.values():
         seen = view.seen[0]
         slope = view.jacobian(position[seen])[0]
         information[seen] += slope.swapaxes(1, 2) @ np.linalg.solve(view.covariance[0, seen], slope)
+        away[seen] += view.viewing_directions[0]
     values, vectors = np.linalg.eigh(information)
-    values, axes = values[:, ::-1], vectors[:, :, ::-1].swapaxes(1, 2)
+    values, axes = values[:, ::-1], vectors[:, :, ::-1].swapaxes(1, 2).copy()
+    axes[:, 2] *= np.where((axes[:, 2] * away).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
     known = values > MIN_ANGLE**2 * np.maximum(values[:, 1:2], 1e-300)
     sigma = np.full(values.shape, np.inf)
     sigma[known] = values[known] ** -0.5

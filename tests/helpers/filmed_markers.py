@@ -1,4 +1,4 @@
-"""Datasets whose markers were filmed: exact positions become pixels of given cameras."""
+"""Datasets and tracks whose markers were filmed: exact positions become pixels of given cameras."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,11 +7,15 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera
+from rafl.calibration.rig import Rig, rig_text
 from rafl.data.dataset import Dataset, Trajectory
 from rafl.data.views import View
+from rafl.tracking.reconstruction.tracks import Tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
 
 SIZE = (1280, 720)
 PIXELS_PER_METRE = 8000.0
+POSE_SIGMA = np.array([1e-4, 2e-4, 1e-4, 5e-6, 2e-6, 5e-6])  # of a moving frame [rad, m]
 
 
 def side_camera(angle: float, distortion: tuple[float, float] = (0.0, 0.0)) -> OrthographicCamera:
@@ -61,7 +65,7 @@ def filmed(
         cameras: in the specimen frame where it starts.
         sigma: of the pixels [px].
         noise: adds errors of this sigma to the pixels; none if None.
-        moving: whether the specimen frame turns by 6 degrees and shifts by 5 mm.
+        moving: whether the specimen frame turns by 6 degrees and shifts by 5 mm, as known to POSE_SIGMA.
     """
 
     def view(camera: Camera, item: Trajectory) -> View:
@@ -72,7 +76,8 @@ def filmed(
             pixel = pixel + noise.normal(0.0, sigma, pixel.shape)
         covariance = np.where(item.valid[..., None, None], sigma**2 * np.eye(2), np.nan)
         found = View(camera, np.where(item.valid[..., None], pixel, np.nan), covariance, np.zeros(len(item.time)))
-        return replace(found, rotation=rotation, translation=translation) if moving else found
+        known = np.broadcast_to(np.diag(POSE_SIGMA**2), (len(rotation), 6, 6))
+        return replace(found, rotation=rotation, translation=translation, pose_covariance=known) if moving else found
 
     return replace(
         dataset,
@@ -80,4 +85,49 @@ def filmed(
             name: replace(item, views={key: view(camera, item) for key, camera in cameras.items()})
             for name, item in dataset.trajectories.items()
         },
+    )
+
+
+def filmed_tracks(
+    names: tuple[str, ...],
+    exact: np.ndarray,
+    cameras: Mapping[str, Camera],
+    sigma: float = 0.02,
+    noise: np.ndarray | float = 0.0,
+    seen: Mapping[str, np.ndarray] | None = None,
+) -> Tracks:
+    """Tracks of markers at exact positions in the cameras' frame, at 100 frames/s.
+
+    Args:
+        names: of the markers, (M).
+        exact: [m], (T, M, 3).
+        cameras: by name.
+        sigma: of the pixels [px].
+        noise: their errors [px], (T, M, 2).
+        seen: which markers each camera sees, (M); all if None.
+    """
+    pixels, frames = {}, len(exact)
+    for name, camera in cameras.items():
+        kept = np.ones(len(names), bool) if seen is None else seen[name]
+        pixel = np.where(kept[:, None], camera.project(exact) + noise, np.nan)
+        pixels[name] = CameraPixels(pixel, np.where(np.isfinite(pixel), sigma, np.nan))
+    rig = Rig(dict(cameras))
+    position, position_sigma, residual = triangulate(rig, pixels)
+    return Tracks(
+        names=names,
+        time=np.arange(frames) / 100.0,
+        position=position,
+        sigma=position_sigma,
+        state=np.isfinite(position[..., 0]).astype(np.uint8),
+        pixel={name: item.pixel for name, item in pixels.items()},
+        residual=residual,
+        pixel_sigma={name: item.sigma for name, item in pixels.items()},
+        damaged={name: np.zeros(frames, bool) for name in pixels},
+        frame={name: np.arange(frames) for name in pixels},
+        images={name: {} for name in pixels},
+        fps=100.0,
+        calibration=rig_text(rig),
+        sources={},
+        settings="",
+        longest_gap=5,
     )

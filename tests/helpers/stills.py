@@ -1,22 +1,24 @@
 """Recordings of a box at rest whose dots are at known places."""
 
 import functools
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
+from filmed_markers import filmed_tracks
 from scipy.spatial.transform import Rotation
 
-from rafl.calibration.camera import OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, rig_text
+from rafl.calibration.camera import Camera, OrthographicCamera, Plane
+from rafl.calibration.rig import Rig
+from rafl.capture.dataset.sources import read_recording
 from rafl.capture.description.specimen_text import body_of_box
 from rafl.capture.registration.recording import Recording
 from rafl.capture.specimen.specimen import Body, Specimen, build_specimen
 from rafl.data.markers import embed
 from rafl.data.synthetic import with_material
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.reconstruction.tracks import Tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
 
 SIZE_MM = (100.0, 20.0, 20.0)
 FRAMES = 12
@@ -44,15 +46,18 @@ def _sagging(stiffness: float) -> np.ndarray:
     return true.equilibrium(true.weight[None])[0]
 
 
+def _recorded(places_mm: np.ndarray, q: np.ndarray) -> tuple[tuple[str, ...], np.ndarray]:
+    """Names and positions [m], (M, 3), of dots on the deformed box."""
+    names = tuple(f"left-r1c{number + 1}" for number in range(len(places_mm)))
+    return names, embed(_specimen().mesh, names, 1e-3 * places_mm).positions(torch.from_numpy(q)).numpy()
+
+
 def still(places_mm: np.ndarray, stiffness: float = 1.0, lying: bool = False) -> Recording:
     """A recording of the box, that is `stiffness` times as stiff as assumed, with dots at `places_mm` (M, 3).
 
     As one camera sees them, dots on the sides have an assumed y, with a sigma of 0.5 mm.
     """
-    mesh = _specimen().mesh
-    q = mesh.vertices if lying else _sagging(stiffness)
-    names = tuple(f"left-r1c{number + 1}" for number in range(len(places_mm)))
-    position = embed(mesh, names, 1e-3 * places_mm).positions(torch.from_numpy(q)).numpy()
+    names, position = _recorded(places_mm, _specimen().mesh.vertices if lying else _sagging(stiffness))
     sigma = np.full_like(position, 2e-5)
     on_side = np.isin(places_mm[:, 1], (0.0, SIZE_MM[1]))
     position[on_side, 1], sigma[on_side, 1] = 1e-3 * places_mm[on_side, 1], 5e-4
@@ -77,22 +82,21 @@ STILL_RIG = Rig({"left": LEFT, "right": RIGHT})
 def still_tracks(places_mm: np.ndarray = SIDES) -> Tracks:
     """The tracks of the sagging box, of which a camera sees the left and another one the right side."""
     recording = still(places_mm)
-    pixels = {}
-    for name, y in (("left", 0.0), ("right", SIZE_MM[1])):
-        seen = (places_mm[:, 1] == y)[:, None]
-        path = np.where(seen, STILL_RIG.cameras[name].project(recording.position), np.nan)
-        pixels[name] = CameraPixels(path, np.where(seen, 0.02, np.full_like(path, np.nan)))
-    position, sigma, residual = triangulate(STILL_RIG, pixels)
     assert recording.names is not None
-    return Tracks(
-        names=recording.names, time=recording.time, position=position, sigma=sigma,
-        state=np.isfinite(position[..., 0]).astype(np.uint8),
-        pixel={camera: item.pixel for camera, item in pixels.items()}, residual=residual,
-        pixel_sigma={camera: item.sigma for camera, item in pixels.items()},
-        damaged={camera: np.zeros(FRAMES, bool) for camera in pixels},
-        frame={camera: np.arange(FRAMES) for camera in pixels}, images={camera: {} for camera in pixels}, fps=100.0,
-        calibration=rig_text(STILL_RIG), sources={}, settings="", longest_gap=5,
-    )  # fmt: skip
+    seen = {"left": places_mm[:, 1] == 0.0, "right": places_mm[:, 1] == SIZE_MM[1]}
+    return filmed_tracks(recording.names, recording.position, STILL_RIG.cameras, seen=seen)
+
+
+def filmed_still(
+    folder: Path, places_mm: np.ndarray, cameras: Mapping[str, Camera], stiffness: float = 1.0, seed: int = 1
+) -> Recording:
+    """A recording of the sagging box by cameras that see all dots, with errors of 0.02 px, read from its tracks."""
+    names, exact = _recorded(places_mm, _sagging(stiffness))
+    noise = np.random.default_rng(seed).normal(0.0, 0.02, (FRAMES, len(names), 2))
+    write_tracks(
+        folder / "still.h5", filmed_tracks(names, np.repeat(exact[None], FRAMES, axis=0), cameras, noise=noise)
+    )
+    return read_recording(folder / "still.h5", 100.0)
 
 
 def corner_pixels(camera: str) -> np.ndarray:

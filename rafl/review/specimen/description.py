@@ -111,6 +111,7 @@ def describe_tracks(tracks: CorrectedTracks, path: Path, form: BodyForm) -> Desc
         names=tuple(name for name in names if name not in form.left_out),
         position=recording.position[:, kept],
         sigma=recording.sigma[:, kept],
+        views={camera: view.select_markers(np.flatnonzero(kept)) for camera, view in recording.views.items()},
     )
     sigma = MODULUS_SIGMA if form.youngs_modulus is None else MEASURED_SIGMA
     try:

@@ -8,16 +8,15 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from filmed_markers import side_camera
+from filmed_markers import filmed_tracks, side_camera
 from scipy.spatial.transform import Rotation
 
 from rafl.calibration.camera import OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, rig_text
 from rafl.capture.dataset.build import build_dataset
-from rafl.capture.dataset.registered import average_views
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.summary import missing_pixels
 from rafl.capture.dataset.table import RecordingRow
+from rafl.capture.registration.averaging import average_views
 from rafl.capture.registration.rigid import RigidTransform
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.capture.specimen.specimen import Specimen
@@ -28,8 +27,7 @@ from rafl.data.objective import Recordings, recording_losses
 from rafl.evaluation.metrics import compare
 from rafl.fitting.fit import fit
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.tracks import read_tracks, write_tracks
 
 FRAMES, SIGMA_PX = 8, 0.02
 ROW = RecordingRow(recording="swing", load_g=60, split="train")
@@ -64,37 +62,12 @@ def write_filmed(
     hidden: tuple[int, int] | None = None,
 ) -> None:
     """Tracks of markers at exact positions [m], (T, M, 3), in the cameras' frame, with an error of the pixels."""
-    pixel = {name: camera.project(exact) + noise for name, camera in cameras.items()}
-    sigma = {name: np.full_like(own, SIGMA_PX) for name, own in pixel.items()}
-    rig = Rig(dict(cameras))
-    position, position_sigma, residual = triangulate(
-        rig, {name: CameraPixels(pixel[name], sigma[name]) for name in cameras}
-    )
-    state = np.ones(position.shape[:2], np.uint8)
+    tracks = filmed_tracks(names, exact, cameras, SIGMA_PX, noise)
     if hidden is not None:
-        state[hidden] = 2
+        tracks.state[hidden] = 2
         for name in cameras:
-            pixel[name][hidden], sigma[name][hidden] = np.nan, np.nan
-    write_tracks(
-        folder / "swing.h5",
-        Tracks(
-            names=names,
-            time=0.01 * np.arange(FRAMES),
-            position=position,
-            sigma=position_sigma,
-            state=state,
-            pixel=pixel,
-            residual=residual,
-            pixel_sigma=sigma,
-            damaged={name: np.zeros(FRAMES, bool) for name in cameras},
-            frame={name: np.arange(FRAMES) for name in cameras},
-            images={name: {} for name in cameras},
-            fps=100.0,
-            calibration=rig_text(rig),
-            sources={},
-            settings="",
-        ),
-    )
+            tracks.pixel[name][hidden], tracks.pixel_sigma[name][hidden] = np.nan, np.nan
+    write_tracks(folder / "swing.h5", tracks)
 
 
 def build(specimen: Specimen, folder: Path) -> Dataset:
@@ -149,8 +122,10 @@ def clamp_motion(in_plane: bool) -> RigidTransform:
     return RigidTransform(Rotation.from_rotvec(0.1 * time * axis).as_matrix(), time**2 * shift)
 
 
-def write_moving(folder: Path, specimen: Specimen, motion: np.ndarray, cameras: int) -> tuple[Specimen, np.ndarray]:
-    """Tracks of a specimen in a moving clamp, as one or two cameras see it.
+def write_moving(
+    folder: Path, specimen: Specimen, motion: np.ndarray, cameras: int, noise: float = 0.0
+) -> tuple[Specimen, np.ndarray]:
+    """Tracks of a specimen in a moving clamp, as one or two cameras see it, with errors of the pixels of `noise`.
 
     Returns:
         The specimen with the clamp's markers, and its own markers in its frame [m], (T, M, 3).
@@ -163,7 +138,8 @@ def write_moving(folder: Path, specimen: Specimen, motion: np.ndarray, cameras: 
     rig = {"left": replace(side_camera(0.1, (0.02, -0.01)), plane=Plane((0.0, 1.0, 0.0), 0.0, 5e-4))}
     if cameras > 1:
         rig["right"] = side_camera(1.2)
-    write_filmed(folder, specimen.layout.names + layout.names, at_rest, rig)
+    errors = noise * np.random.default_rng(0).normal(size=(*at_rest.shape[:2], 2))
+    write_filmed(folder, specimen.layout.names + layout.names, at_rest, rig, errors)
     return replace(specimen, clamp_layout=layout), exact
 
 
@@ -188,6 +164,28 @@ def test_pixels_are_kept_where_the_clamp_moves(
     distance = np.sqrt(((item.q - motion[0]) ** 2).sum(-1).mean())
     assert distance < (4e-4 if cameras == 1 else 1e-4)
     assert item.attributes["fit_residual_mm"] < 0.01
+
+
+@pytest.mark.parametrize("cameras", [1, 2])
+def test_errors_of_the_clamp_are_those_of_the_specimen(
+    cameras: int, front: Specimen, motion: np.ndarray, tmp_path: Path
+) -> None:
+    """The true motion differs from the pixels by as much as they and the poses of the clamp are uncertain."""
+    specimen, exact = write_moving(tmp_path, front, motion, cameras, SIGMA_PX)
+    dataset = build(specimen, tmp_path)
+    recordings = Recordings.of(dataset, ["swing"])
+    exactly = {name: replace(term, by_pose=torch.zeros_like(term.by_pose)) for name, term in recordings.terms.items()}
+    squares = []
+    for each in (recordings, replace(recordings, terms=exactly)):
+        own = [
+            gap / (term.root[..., :1, 0] * SIGMA_PX)
+            for gap, term in zip(each.gaps(torch.from_numpy(exact)[:, None]), each.terms.values(), strict=True)
+        ]
+        squares.append(np.mean([float(gap.square().mean()) for gap in own]))
+    assert 0.7 < squares[0] < 1.2
+    assert squares[1] > 2.0
+    sigma = dataset.trajectories["swing"].sigma[0]
+    assert sigma[-1, 2] > 1.5 * SIGMA_PX / 8000.0
 
 
 def test_dropped_frames_of_a_moving_clamp_are_gaps(front: Specimen, motion: np.ndarray, tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import torch
 from filmed_markers import side_camera
 
 from rafl.calibration.camera import Camera
-from rafl.capture.dataset.registered import average_views
+from rafl.capture.registration.averaging import average_views
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.initial import fit_first_frame
 from rafl.capture.specimen.specimen import Specimen

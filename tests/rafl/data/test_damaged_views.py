@@ -82,6 +82,13 @@ DAMAGE: dict[str, tuple[Callable[[h5py.Group], None], str]] = {
     "no translation": (remove("left/translation"), f"{LEFT}: expected both rotation and translation"),
     "stretched": (entry("left/rotation", 3, 2.0 * np.eye(3)), f"{LEFT}/rotation: expected rotation matrices"),
     "mirrored": (entry("left/rotation", 3, -np.eye(3)), f"{LEFT}/rotation: expected rotation matrices"),
+    "fewer covariances": (
+        put("left/pose_covariance", lambda x: x[:-1]),
+        rf"{LEFT}/pose_covariance: expected shape \(25, 6, 6\)",
+    ),
+    "skewed pose": (entry("left/pose_covariance", (3, 0, 1), 1e-9), f"{LEFT}/pose_covariance: expected symmetric"),
+    "indefinite pose": (entry("left/pose_covariance", 3, -np.eye(6)), f"{LEFT}/pose_covariance: expected positive"),
+    "endless pose": (entry("left/pose_covariance", 3, np.inf), f"{LEFT}/pose_covariance: expected finite numbers"),
     "far": (entry("left/translation", 3, 1e11), f"{LEFT}: {PIXELS_OFF}"),
     "infinite pixel": (entry("left/pixel", (3, 2), np.inf), f"{LEFT}/{WHOLE_PIXELS}"),
     "half a pixel": (entry("left/pixel", (3, 2), [np.nan, 5.0]), f"{LEFT}/{WHOLE_PIXELS}"),

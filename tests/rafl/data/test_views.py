@@ -7,10 +7,11 @@ import h5py
 import numpy as np
 import pytest
 import torch
-from filmed_markers import PIXELS_PER_METRE, filmed, frame_motion, pinhole_camera, side_camera
+from filmed_markers import PIXELS_PER_METRE, POSE_SIGMA, filmed, frame_motion, pinhole_camera, side_camera
 from scipy.spatial.transform import Rotation
 
 from rafl.common.errors import InputError
+from rafl.data.camera_terms import CameraTerm
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, write_dataset
 from rafl.data.objective import Recordings, frame_errors, loss_curvature, recording_losses, training_loss
@@ -155,6 +156,47 @@ def test_a_moving_frame_counts_at_the_times_of_the_camera(dataset: Dataset) -> N
     assert float(late.gaps(recordings.markers)[0].abs().max()) > 1e-5
 
 
+def test_errors_of_a_frame_count_as_what_they_are(dataset: Dataset) -> None:
+    """The loss is r . C^-1 r for the pixels of all cameras and the covariance of their own errors and the pose's."""
+    with_views = filmed(dataset, CAMERAS, moving=True)
+    recordings = Recordings.of(with_views, ["a"])
+    offset = random_offsets(recordings, 1e-5)
+    found = recordings.gaps(recordings.markers + offset)
+    for frame in (0, 7):
+        gaps, slopes, variances = [], [], []
+        for view in with_views.trajectories["a"].views.values():
+            markers = recordings.markers[:, 0].numpy()
+            gaps.append((view.project(markers + offset[:, 0].numpy()) - view.pixel)[frame].ravel())
+            slopes.append(view.pose_slope(markers)[frame].reshape(-1, 6))
+            variances.append(np.diagonal(view.covariance[frame], axis1=1, axis2=2).ravel())
+        gap, slope = np.concatenate(gaps), np.concatenate(slopes)
+        whole = np.diag(np.concatenate(variances)) + slope @ np.diag(POSE_SIGMA**2) @ slope.T
+        reference = 0.02 / PIXELS_PER_METRE
+        square = sum(float(part[frame].square().sum()) for part in found) / reference**2
+        assert square == pytest.approx(gap @ np.linalg.solve(whole, gap), rel=1e-6)
+        assert square < gap @ (gap / np.concatenate(variances)) - 1.0
+
+
+def test_an_error_of_the_frame_costs_little(dataset: Dataset) -> None:
+    """As large as its sigma says, it costs at most 1, however many pixels show it."""
+    recordings = Recordings.of(filmed(dataset, CAMERAS, moving=True), ["a"])
+    markers = recordings.markers
+    turn = torch.tensor([1e-4, 0.0, 0.0], dtype=torch.float64)
+    turned = markers + torch.linalg.cross(turn.expand_as(markers), markers)
+    exact = replace(recordings, terms={name: _exact(term) for name, term in recordings.terms.items()})
+    squares = [
+        sum(part.square().sum((1, 2, 3)) for part in each.gaps(turned)) / (0.02 / PIXELS_PER_METRE) ** 2
+        for each in (recordings, exact)
+    ]
+    assert float(squares[0].max()) < 1.0
+    assert float(squares[1].min()) > 10.0
+
+
+def _exact(term: CameraTerm) -> CameraTerm:
+    """What a camera measured, if the poses were exact."""
+    return replace(term, by_pose=torch.zeros_like(term.by_pose))
+
+
 def test_seen_directions_turn_with_the_frame(dataset: Dataset) -> None:
     """The direction that one camera does not see is its line of sight, in the specimen frame of each time."""
     recordings = Recordings.of(filmed(dataset, {"left": side_camera(0.0)}, moving=True), ["a"])
@@ -178,7 +220,7 @@ def test_seen_axes_of_one_and_two_cameras() -> None:
     metres = 0.02 / PIXELS_PER_METRE
     np.testing.assert_allclose(sigma[0], [metres * np.sqrt(0.8), metres, 2.0 * metres])  # z twice, x, y
     np.testing.assert_allclose(sigma[1], [metres, metres, np.inf])
-    np.testing.assert_allclose(np.abs(axes[1, 2]), [0.0, 1.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(axes[1, 2], [0.0, 1.0, 0.0], atol=1e-12)  # away from the camera
     assert np.isinf(sigma[2]).all()
 
 
@@ -196,10 +238,25 @@ def test_views_are_stored_with_their_cameras(dataset: Dataset, tmp_path: Path) -
             np.testing.assert_array_equal(own.covariance, view.covariance)
             np.testing.assert_allclose(own.project(item.markers), view.project(item.markers), atol=1e-9)
             assert (own.rotation is not None) == (name == "b")
+            if name == "b":
+                np.testing.assert_array_equal(own.pose_covariance, view.pose_covariance)
     assert damaged_parts(path) == []
     with h5py.File(path, "r+") as file:
         file["trajectories/a/views/left/pixel"][3, 2] += 1.0
     assert damaged_parts(path) == ["trajectories/a"]
+
+
+def test_files_of_the_third_format_are_read(dataset: Dataset, tmp_path: Path) -> None:
+    """Their moving frames have poses without errors."""
+    path = tmp_path / "old.h5"
+    write_dataset(path, filmed(dataset, CAMERAS, moving=True))
+    with h5py.File(path, "r+") as file:
+        for view in (file[f"trajectories/{name}/views/{camera}"] for name in "ab" for camera in CAMERAS):
+            del view["pose_covariance"]
+        file.attrs["format"] = "rafl-dataset/3"
+    found = Recordings.of(read_dataset(path), ["a"])
+    assert float(recording_losses(found, found.markers)) < 1e-18
+    assert not found.terms["left"].by_pose.any()
 
 
 def test_files_of_the_second_format_are_read(dataset: Dataset, tmp_path: Path) -> None:
@@ -247,6 +304,13 @@ def test_parts_of_recordings_keep_their_pixels(dataset: Dataset, moving: bool) -
     with_views = filmed(dataset, CAMERAS, noise=np.random.default_rng(0), moving=moving)
     recordings = Recordings.of(with_views, ["a", "b", "c"])
     part = recordings.select([2, 0]).first_frames(7).select_markers(np.array([3, 5]))
+    for name, term in part.terms.items():
+        assert bool(term.by_pose.any()) == moving
+        assert torch.equal(term.by_pose, recordings.terms[name].by_pose[:7, [2, 0]][:, :, [3, 5]])
+    # Errors of the pose couple the markers of a frame.
+    recordings, part = (
+        replace(each, terms={name: _exact(term) for name, term in each.terms.items()}) for each in (recordings, part)
+    )
     simulated = recordings.markers[:7, [2, 0]][:, :, [3, 5]] + 1e-3
     whole = [gap[:7][:, [2, 0]][:, :, [3, 5]] for gap in recordings.gaps(recordings.markers + 1e-3)]
     for own, expected in zip(part.gaps(simulated), whole, strict=True):

@@ -99,7 +99,7 @@ def test_what_cannot_be_shown_is_refused(run_folder: Path, tmp_path: Path) -> No
     for name, message in (
         ("fitted", r"rafl-eval .*fitted DATASET\.h5"),
         ("empty", r"expected tracks .* or an evaluated model"),
-        ("other.h5", r"expected format rafl-dataset/3 .* found 'rafl-evaluation/1'"),
+        ("other.h5", r"expected format rafl-dataset/4 .* found 'rafl-evaluation/1'"),
     ):
         with pytest.raises(InputError, match=message):
             open_view(tmp_path / name, None, "Ann")
