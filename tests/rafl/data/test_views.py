@@ -118,19 +118,43 @@ def test_one_marker_far_off_counts_linearly(dataset: Dataset) -> None:
     assert losses[1:] == pytest.approx([1e3 * 7.0 * limit**2, 1e3 * 15.0 * limit**2])
 
 
-def test_lags_are_exact_for_cubic_paths() -> None:
-    random = np.random.default_rng(0)
-    time = torch.arange(9, dtype=torch.float64)
-    factors = torch.from_numpy(random.normal(size=(4, 2, 5, 3)))
+@pytest.mark.parametrize("frames", [2, 3, 5, 9])
+def test_lags_are_exact_for_polynomials_through_six_frames(frames: int) -> None:
+    """Of order 5, or lower by as many frames as there are fewer than 6."""
+    random, terms = np.random.default_rng(0), min(frames, 6)
+    time = torch.arange(frames, dtype=torch.float64)
+    factors = torch.from_numpy(random.normal(size=(terms, 2, 5, 3)))
 
     def path(t: torch.Tensor) -> torch.Tensor:
-        powers = torch.stack([t**k for k in range(4)])
+        powers = torch.stack([(t / frames) ** k for k in range(terms)])
         return torch.einsum("ktb,kbmi->tbmi", powers, factors)
 
-    lag = torch.from_numpy(random.uniform(-1.0, 1.0, (9, 2)))
+    lag = torch.from_numpy(random.uniform(-1.0, 1.0, (frames, 2)))
     own = path(time[:, None].repeat(1, 2))
-    np.testing.assert_allclose(at_lags(own, lag).numpy(), path(time[:, None] + lag).numpy(), rtol=1e-9)
-    assert at_lags(own, torch.zeros(9, 2)) is own
+    np.testing.assert_allclose(at_lags(own, lag).numpy(), path(time[:, None] + lag).numpy(), atol=1e-10)
+    assert at_lags(own, torch.zeros(frames, 2)) is own
+
+
+def test_lags_of_an_oscillation_are_nearly_exact() -> None:
+    phase = 2.0 * np.pi / 14.0 * np.arange(60)
+    late = 2.0 * np.pi / 14.0 * (np.arange(60) + 0.5)
+    found = at_lags(torch.from_numpy(np.sin(phase))[:, None], torch.full((60, 1), 0.5, dtype=torch.float64))[:, 0]
+    error = np.abs(found.numpy() - np.sin(late))
+    assert error[2:-3].max() < 5e-5
+    assert error[:-1].max() < 2e-4
+
+
+def test_what_was_measured_after_the_last_frame_is_not_compared(dataset: Dataset) -> None:
+    """A camera that is late by half a frame filmed the last row when a simulation up to there has ended."""
+    step = dataset.simulator.time_step
+    recordings = filmed(dataset, {"left": side_camera(0.3), "right": side_camera(-0.3)})
+    item = recordings.trajectories["a"]
+    frames = len(item.time)
+    views = {"left": item.views["left"], "right": replace(item.views["right"], lag=np.full(frames, 0.5 * step))}
+    late = Recordings.of(replace(recordings, trajectories={"a": replace(item, views=views)}), ["a"])
+    for part, count in ((late, frames), (late.first_frames(5), 5)):
+        seen = {name: term.seen.amax((1, 2)).bool().tolist() for name, term in part.terms.items()}
+        assert seen == {"left": [True] * count, "right": [True] * (count - 1) + [False]}
 
 
 def test_a_moving_frame_counts_at_the_times_of_the_camera(dataset: Dataset) -> None:
