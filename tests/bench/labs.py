@@ -9,6 +9,7 @@ shapes, fewer recordings and fewer frames.
 """
 
 import argparse
+import sys
 import time
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -37,7 +38,10 @@ from rafl.evaluation.oscillation import fit_oscillation, most_active_coordinate
 from rafl.fem.material import Material
 from rafl.fem.maxwell import complex_modulus
 from rafl.fitting.run_folder import FittedModel, load_model
-from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
+from rafl.tracking.reconstruction.tracks import write_tracks
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
+from synthetic_tracks import tracks_of_positions
 
 SPECIMENS = Path(__file__).parents[2] / "datasets" / "specimens"
 TRAINED_ON = "canonical"
@@ -191,12 +195,13 @@ class Laboratory:
         tracks = self.out / shape / "tracks"
         missing = [k for k in self.splits(shape) if not (tracks / f"w{k:02d}.h5").exists()]
         specimen = self.specimen(shape)
+        names = specimen.layout.names
         for first in range(0, len(missing), SIMULATION_BATCH):
             chosen = missing[first : first + SIMULATION_BATCH]
             start = time.perf_counter()
             positions = self.markers(specimen, chosen, self.size.frames)
             for b, k in enumerate(chosen):
-                write_tracks(tracks / f"w{k:02d}.h5", exact_tracks(specimen, positions[:, b]))
+                write_tracks(tracks / f"w{k:02d}.h5", tracks_of_positions(names, positions[:, b], TRACKED_SIGMA, FPS))
             print(f"{self.name}, {shape}: recorded weights {chosen} in {time.perf_counter() - start:.0f} s", flush=True)
 
     def markers(self, specimen: Specimen, weights: list[int], frames: int) -> np.ndarray:
@@ -312,27 +317,6 @@ class Laboratory:
         q = loaded_equilibria(specimen.simulator(1.0 / FPS), specimen.loaded, loads)
         sag: np.ndarray = (specimen.mesh.vertices - q)[:, specimen.loaded, 2].mean(1)
         return sag
-
-
-def exact_tracks(specimen: Specimen, position: np.ndarray) -> Tracks:
-    """Tracks of exact marker positions (T, M, 3) [m], in the specimen frame."""
-    return Tracks(
-        names=specimen.layout.names,
-        time=np.arange(len(position)) / FPS,
-        position=position,
-        sigma=np.full_like(position, TRACKED_SIGMA),
-        state=np.ones(position.shape[:2], dtype=np.uint8),
-        pixel={},
-        residual={},
-        pixel_sigma={},
-        damaged={},
-        frame={},
-        images={},
-        fps=FPS,
-        calibration="",
-        sources={},
-        settings="",
-    )
 
 
 def show_row(label: str, row: dict[str, float]) -> None:

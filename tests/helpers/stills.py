@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
+from synthetic_tracks import tracks_of_pixels
 
 from rafl.calibration.camera import OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, rig_text
+from rafl.calibration.rig import Rig
 from rafl.capture.description.specimen_text import body_of_box
 from rafl.capture.registration.recording import Recording
 from rafl.capture.specimen.specimen import Body, Specimen, build_specimen
@@ -16,7 +17,7 @@ from rafl.data.markers import embed
 from rafl.data.synthetic import with_material
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.reconstruction.tracks import Tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.triangulation import CameraPixels
 
 SIZE_MM = (100.0, 20.0, 20.0)
 FRAMES = 12
@@ -82,17 +83,8 @@ def still_tracks(places_mm: np.ndarray = SIDES) -> Tracks:
         seen = (places_mm[:, 1] == y)[:, None]
         path = np.where(seen, STILL_RIG.cameras[name].project(recording.position), np.nan)
         pixels[name] = CameraPixels(path, np.where(seen, 0.02, np.full_like(path, np.nan)))
-    position, sigma, residual = triangulate(STILL_RIG, pixels)
     assert recording.names is not None
-    return Tracks(
-        names=recording.names, time=recording.time, position=position, sigma=sigma,
-        state=np.isfinite(position[..., 0]).astype(np.uint8),
-        pixel={camera: item.pixel for camera, item in pixels.items()}, residual=residual,
-        pixel_sigma={camera: item.sigma for camera, item in pixels.items()},
-        damaged={camera: np.zeros(FRAMES, bool) for camera in pixels},
-        frame={camera: np.arange(FRAMES) for camera in pixels}, images={camera: {} for camera in pixels}, fps=100.0,
-        calibration=rig_text(STILL_RIG), sources={}, settings="", longest_gap=5,
-    )  # fmt: skip
+    return tracks_of_pixels(recording.names, STILL_RIG, pixels, longest_gap=5)
 
 
 def corner_pixels(camera: str) -> np.ndarray:

@@ -10,9 +10,10 @@ import pytest
 import torch
 from filmed_markers import side_camera
 from scipy.spatial.transform import Rotation
+from synthetic_tracks import tracks_of_pixels
 
 from rafl.calibration.camera import OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, rig_text
+from rafl.calibration.rig import Rig
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.registered import average_views
 from rafl.capture.dataset.settings import CaptureSettings
@@ -28,8 +29,8 @@ from rafl.data.objective import Recordings, recording_losses
 from rafl.evaluation.metrics import compare
 from rafl.fitting.fit import fit
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.tracks import read_tracks, write_tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels
 
 FRAMES, SIGMA_PX = 8, 0.02
 ROW = RecordingRow(recording="swing", load_g=60, split="train")
@@ -65,36 +66,13 @@ def write_filmed(
 ) -> None:
     """Tracks of markers at exact positions [m], (T, M, 3), in the cameras' frame, with an error of the pixels."""
     pixel = {name: camera.project(exact) + noise for name, camera in cameras.items()}
-    sigma = {name: np.full_like(own, SIGMA_PX) for name, own in pixel.items()}
-    rig = Rig(dict(cameras))
-    position, position_sigma, residual = triangulate(
-        rig, {name: CameraPixels(pixel[name], sigma[name]) for name in cameras}
-    )
-    state = np.ones(position.shape[:2], np.uint8)
+    pixels = {name: CameraPixels(own, np.full_like(own, SIGMA_PX)) for name, own in pixel.items()}
+    tracks = tracks_of_pixels(names, Rig(dict(cameras)), pixels)
     if hidden is not None:
-        state[hidden] = 2
+        tracks.state[hidden] = 2
         for name in cameras:
-            pixel[name][hidden], sigma[name][hidden] = np.nan, np.nan
-    write_tracks(
-        folder / "swing.h5",
-        Tracks(
-            names=names,
-            time=0.01 * np.arange(FRAMES),
-            position=position,
-            sigma=position_sigma,
-            state=state,
-            pixel=pixel,
-            residual=residual,
-            pixel_sigma=sigma,
-            damaged={name: np.zeros(FRAMES, bool) for name in cameras},
-            frame={name: np.arange(FRAMES) for name in cameras},
-            images={name: {} for name in cameras},
-            fps=100.0,
-            calibration=rig_text(rig),
-            sources={},
-            settings="",
-        ),
-    )
+            tracks.pixel[name][hidden], tracks.pixel_sigma[name][hidden] = np.nan, np.nan
+    write_tracks(folder / "swing.h5", tracks)
 
 
 def build(specimen: Specimen, folder: Path) -> Dataset:
