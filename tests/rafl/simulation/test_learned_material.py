@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from rafl.fem.learned_energy import UNITS as ENERGY_UNITS
-from rafl.fem.learned_energy import shared_weights
-from rafl.fem.learned_viscosity import UNITS as VISCOSITY_UNITS
+from rafl.fem.learned.energy import UNITS as ENERGY_UNITS
+from rafl.fem.learned.energy import shared_weights
+from rafl.fem.learned.viscosity import UNITS as VISCOSITY_UNITS
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.rollout import Start, equilibrium, rollout, simulate_steps
