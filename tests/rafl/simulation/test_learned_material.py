@@ -46,6 +46,13 @@ def deformed(simulator: Simulator, seed: int, size: float = 3e-3) -> np.ndarray:
     return q
 
 
+def test_weights_are_as_the_kernels_take_them() -> None:
+    """For an array of another layout all kernels would be compiled again."""
+    weights = beam(learned_material(0)).constitutive_state(3).energy_weights
+    assert weights is not None
+    assert weights.flags.c_contiguous
+
+
 @SCHEMES
 @SEEDS
 def test_engines_agree(integration: str, seed: int) -> None:
