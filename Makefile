@@ -34,7 +34,8 @@ demo: install
 	$(BIN)/rafl-eval $(DEMO)/run $(DEMO)/canonical.h5
 
 # Two workers of one thread each: kernels with several threads in each would compete for the cores.
-test: install lint docs
+test: install
+	$(MAKE) --no-print-directory --jobs 2 --output-sync lint docs
 	NUMBA_NUM_THREADS=1 OMP_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
 
 # Long runs: 10,000 time steps, oscillations of 10 s, whole sweeps, fits of the real beam.
@@ -49,7 +50,7 @@ build/types: $(VENV)/installed $(wildcard rafl/*)
 lint: install build/types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
+	$(BIN)/mypy --num-workers 2
 
 # The documentation site, in build/site; a broken link or reference is an error.
 docs: install build/types

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from rafl.batch.options import Batch, ClusterOption, JobsOption, OnOption, PrintOption, StatusOption, Where
-from rafl.common.command_line import create_app, report_errors
+from rafl.common.command_line import SharedCommand, create_app, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import require_file
 from rafl.simulation.device import CPU, check_device_name
@@ -22,7 +22,7 @@ fit_app = create_app("Fit a model to recordings.")
 eval_app = create_app("Evaluate fitted models on recordings.")
 
 
-@fit_app.command()
+@fit_app.command(cls=SharedCommand)
 @report_errors
 def fit(
     datasets: Annotated[list[Path], typer.Argument(help="Dataset files (.h5) to train on.", metavar="DATASET...")],

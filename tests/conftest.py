@@ -1,15 +1,12 @@
 """Fixtures that several tests share: a small specimen, a random generator, a runner of commands."""
 
 import contextlib
-import multiprocessing
-import subprocess
-import tempfile
-from multiprocessing.reduction import DupFd
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support import SMALL_SPECIMEN, Run, run_console_script
+from started import Started
+from support import SMALL_SPECIMEN, Run
 
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 
@@ -29,10 +26,6 @@ def _delete_stale_kernels() -> None:
 
 
 _delete_stale_kernels()
-
-# The server process imports the modules once. Every command is a fork of it.
-COMMANDS = multiprocessing.get_context("forkserver")
-COMMANDS.set_forkserver_preload(["support", "rafl.capture.commands", "rafl.commands", "rafl.tracking.commands"])
 
 
 def small_specimen_text() -> str:
@@ -62,23 +55,7 @@ def small_specimen(tmp_path_factory: pytest.TempPathFactory) -> Specimen:
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     """Run a command in a temporary folder and in its own process, a fork of a process that has the imports."""
-
-    def command(name: str, *arguments: object) -> subprocess.CompletedProcess[str]:
-        line = [name, *map(str, arguments)]
-        with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
-            child = COMMANDS.Process(
-                target=run_console_script, args=(line, tmp_path, DupFd(out.fileno()), DupFd(err.fileno()))
-            )
-            child.start()
-            child.join(600)
-            if child.exitcode is None:
-                child.kill()
-                pytest.fail(f"{line} did not end")
-            out.seek(0)
-            err.seek(0)
-            return subprocess.CompletedProcess(line, child.exitcode, out.read(), err.read())
-
-    return command
+    return lambda name, *arguments: Started(tmp_path, name, *arguments).result()
 
 
 @pytest.fixture

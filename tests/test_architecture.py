@@ -1,6 +1,7 @@
 """Imports run one way, folders stay small, and the tests mirror the packages."""
 
 import ast
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,7 @@ FOLDERS = {"rafl": "rafl", "tracking": "rafl.tracking", "capture": "rafl.capture
 MOST_MODULES = 14
 
 
+@cache
 def modules() -> dict[str, Path]:
     """Source files by the name that they are imported as."""
     found = {}
@@ -56,6 +58,7 @@ def modules() -> dict[str, Path]:
     return found
 
 
+@cache
 def imports(path: Path) -> set[str]:
     """Modules of the project that a file imports, also inside functions."""
     names = set()

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import torch
 from support import ROOT, Run
+from synthetic_tracks import tracks_of_positions
 
 import rafl
 from rafl import api
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.fem.laws import LAWS
-from rafl.tracking.reconstruction.tracks import STATES
 
 EXAMPLES = ROOT / "docs" / "examples"
 FRAMES = 24
@@ -28,24 +28,7 @@ def tracks_of(specimen: rafl.Specimen, load: float) -> rafl.Tracks:
     q = np.concatenate([np.repeat(motion.q[:1], 2, axis=0), motion.q])
     markers = specimen.markers(1e-6)
     position = markers.positions(torch.from_numpy(q)).numpy()
-    shape = position.shape[:2]
-    return rafl.Tracks(
-        names=markers.names,
-        time=0.01 * np.arange(len(q)),
-        position=position,
-        sigma=np.full_like(position, 1e-5),
-        state=np.full(shape, STATES.index("measured"), dtype=np.uint8),
-        pixel={},
-        residual={},
-        pixel_sigma={},
-        damaged={},
-        frame={},
-        images={},
-        fps=100.0,
-        calibration="",
-        sources={},
-        settings="",
-    )
+    return tracks_of_positions(markers.names, position, 1e-5)
 
 
 @pytest.fixture(scope="module")

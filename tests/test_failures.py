@@ -14,6 +14,7 @@ import av
 import numpy as np
 import pytest
 import yaml
+from started import Started
 from support import draw_frame, error_lines
 from typer.testing import CliRunner
 
@@ -55,10 +56,14 @@ def command(lab: Path, out: str = "tracks") -> list[str]:
     return [str(lab / "videos"), "--calib", str(lab / "calib.yaml"), "--out", str(lab / out), "--jobs", "2"]
 
 
+def start(lab: Path, out: str = "tracks") -> Started:
+    return Started(lab, "rafl-track", *command(lab, out))
+
+
 def track(lab: Path, out: str) -> None:
     """Run `rafl-track` in its own process: kernels compiled in this process round differently from cached kernels."""
-    program = Path(sys.executable).parent / "rafl-track"
-    subprocess.run([program, *command(lab, out)], check=True, capture_output=True)
+    result = start(lab, out).result()
+    assert result.returncode == 0, result.stderr
 
 
 def tracks_content(folder: Path) -> dict[str, bytes]:
@@ -68,23 +73,21 @@ def tracks_content(folder: Path) -> dict[str, bytes]:
 def test_killed_run_is_completed_by_the_next(lab: Path) -> None:
     """After kills at several moments, the next run gives the same tracks as an undisturbed run."""
     track(lab, "first")  # compiles the kernels
-    program = [str(Path(sys.executable).parent / "rafl-track"), *command(lab)]
-    for wait in (1.5, 2.2, 2.6, 3.0):
-        process = subprocess.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(wait)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
-    track(lab, "tracks")
+    began = time.monotonic()
     track(lab, "undisturbed")
+    took = time.monotonic() - began
+    for share in (0.5, 0.7, 0.8, 0.9):
+        process = start(lab)
+        time.sleep(share * took)
+        process.kill()
+    track(lab, "tracks")
     assert tracks_content(lab / "tracks") == tracks_content(lab / "undisturbed")
     assert {path.name for path in (lab / "tracks").iterdir()} == {"report.html", *tracks_content(lab / "undisturbed")}
 
 
 def test_two_runs_at_once_write_the_same_tracks(lab: Path) -> None:
-    program = [str(Path(sys.executable).parent / "rafl-track"), *command(lab)]
-    both = [subprocess.Popen(program, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) for _ in range(2)]
-    results = [(process.wait(), error_lines(process.stderr.read())) for process in both if process.stderr]
-    assert results == [(0, []), (0, [])]
+    results = [process.result() for process in [start(lab), start(lab)]]
+    assert [(result.returncode, error_lines(result.stderr)) for result in results] == [(0, []), (0, [])]
     track(lab, "undisturbed")
     assert tracks_content(lab / "tracks") == tracks_content(lab / "undisturbed")
     assert not [path for path in (lab / "tracks").iterdir() if path.name.startswith(".")]

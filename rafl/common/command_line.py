@@ -4,13 +4,14 @@ import functools
 import os
 import time
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Column, Table
 from rich.text import Text
+from typer.core import TyperCommand
 
 from rafl.common.errors import InputError
 from rafl.common.interruption import Terminated, interruptible
@@ -18,7 +19,7 @@ from rafl.common.interruption import Terminated, interruptible
 P = ParamSpec("P")
 R = TypeVar("R")
 
-MAX_WAIT = 60.0  # [s], see `failure`; imports from a slow disk take some
+MAX_WAIT = 60.0  # [s], see `_let_first_report`; imports from a slow disk take some
 
 
 def report_errors(command: Callable[P, R]) -> Callable[P, R]:
@@ -54,9 +55,7 @@ def report_errors(command: Callable[P, R]) -> Callable[P, R]:
 def failure(message: str, code: int, shared: bool = True) -> typer.Exit:
     """Report an error in one line on standard error.
 
-    Of the processes that torchrun started on this machine, the first reports an error that all raise. The others wait
-    for torchrun to end them once the first has ended; if one of them ended sooner, torchrun would not let the first
-    report. Whoever waits in vain has an error of its own, and reports it.
+    Of the processes that torchrun started on this machine, the first reports an error that all raise.
 
     Args:
         message: to report.
@@ -66,10 +65,34 @@ def failure(message: str, code: int, shared: bool = True) -> typer.Exit:
     Returns:
         The exit, to be raised.
     """
-    if shared and not _is_first():
-        time.sleep(MAX_WAIT)
+    if shared:
+        _let_first_report()
     typer.echo(one_line(message), err=True)
     return typer.Exit(code)
+
+
+class SharedCommand(TyperCommand):
+    """A command for torchrun: of its processes on this machine, the first reports arguments that cannot be read."""
+
+    def make_context(self, *args: Any, **kwargs: Any) -> Any:
+        """Read the arguments."""
+        try:
+            return super().make_context(*args, **kwargs)
+        except typer.Exit:  # after --help
+            raise
+        except Exception:
+            _let_first_report()
+            raise
+
+
+def _let_first_report() -> None:
+    """Wait in all but the first of the processes that torchrun started on this machine, before an error of all.
+
+    torchrun ends them once the first has ended; if one of them ended sooner, torchrun would not let the first report.
+    Whoever waits in vain has an error of its own, and reports it.
+    """
+    if not _is_first():
+        time.sleep(MAX_WAIT)
 
 
 def _is_first() -> bool:

@@ -123,6 +123,12 @@ class Dataset:
         """
         return replace(self, simulator=self.simulator.on_device(device))
 
+    def first_frames(self, frames: int) -> "Dataset":
+        """The dataset with only the leading frames of each recording; with 0, all of them."""
+        if frames == 0:
+            return self
+        return replace(self, trajectories={name: item.first_frames(frames) for name, item in self.trajectories.items()})
+
     def split(self, name: str) -> list[str]:
         """Names of the recordings of a split, in order."""
         return [key for key, item in self.trajectories.items() if item.split == name]

@@ -49,7 +49,7 @@ class ConstitutiveState:
         hourglass: for `enhanced` integration, else None.
         hourglass_memory: of the viscous forces of the hourglass modes, for `enhanced` integration with viscosity
             [Pa m], (B, E, 12), else None.
-        energy_weights: of the learned energy [Pa], (B, K), see `rafl.fem.learned_energy`; None without it.
+        energy_weights: of the learned energy [Pa], (B, K), see `rafl.fem.learned.energy`; None without it.
     """
 
     moduli: Array

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.fem.laws import LAWS
-from rafl.fem.learned_energy import UNITS as ENERGY_UNITS
-from rafl.fem.learned_viscosity import UNITS as VISCOSITY_UNITS
+from rafl.fem.learned.energy import UNITS as ENERGY_UNITS
+from rafl.fem.learned.viscosity import UNITS as VISCOSITY_UNITS
 from rafl.fem.mesh import HexMesh
 
 MASS_MODELS = ("lumped", "uniform")
@@ -72,9 +72,9 @@ class Material:
         viscosity: Kelvin-Voigt coefficient eta [Pa s]; second Piola-Kirchhoff stress 2 eta dE/dt.
         branch_shares, branch_times: of the Maxwell branches: shear modulus relative to mu at rest, and relaxation time
             [s]; see `rafl.simulation.viscous_memory`. E is the relaxed modulus.
-        energy_weights: of a learned strain energy, see `rafl.fem.learned_energy`, relative to mu / 2. E and nu stay
+        energy_weights: of a learned strain energy, see `rafl.fem.learned.energy`, relative to mu / 2. E and nu stay
             those of small strains: the law takes what the learned energy leaves of mu. Empty for none.
-        dissipation_weights: of a learned viscosity, see `rafl.fem.learned_viscosity`, relative to mu. Empty for none.
+        dissipation_weights: of a learned viscosity, see `rafl.fem.learned.viscosity`, relative to mu. Empty for none.
 
     Raises:
         ValueError: unknown name, or a value outside its physical range.

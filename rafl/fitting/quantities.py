@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rafl.fem.learned_energy import UNITS as ENERGY_UNITS
-from rafl.fem.learned_viscosity import UNITS as VISCOSITY_UNITS
+from rafl.fem.learned.energy import UNITS as ENERGY_UNITS
+from rafl.fem.learned.viscosity import UNITS as VISCOSITY_UNITS
 from rafl.fem.maxwell import branch_shares, branch_times
 
 FIXED_POISSONS_RATIO = 0.499  # nearly incompressible; where only E is identified, as in the paper

@@ -39,18 +39,9 @@ FINAL_RATE_FRACTION = 0.02  # last learning rate as a fraction of the first
 CHECKPOINT_FILE = "checkpoint.pt"
 
 
-def limit_frames(dataset: Dataset, frames: int) -> Dataset:
-    """The dataset with only the first `frames` frames of each recording; 0 for all."""
-    if frames == 0:
-        return dataset
-    return replace(
-        dataset, trajectories={name: item.first_frames(frames) for name, item in dataset.trajectories.items()}
-    )
-
-
 def prepare_datasets(datasets: list[Dataset], settings: Settings) -> list[Dataset]:
     """The datasets with the frames and the integrator of the settings."""
-    return [_with_integrator(limit_frames(dataset, settings.frames), settings) for dataset in datasets]
+    return [_with_integrator(dataset.first_frames(settings.frames), settings) for dataset in datasets]
 
 
 def _with_integrator(dataset: Dataset, settings: Settings) -> Dataset:
@@ -199,7 +190,7 @@ class _Training:
     ) -> None:
         self.settings, self.run, self.group, self.report = settings, run, group, report
         start, full_length = _start_and_datasets(datasets, settings)
-        datasets = [limit_frames(dataset, settings.frames) for dataset in full_length]
+        datasets = [dataset.first_frames(settings.frames) for dataset in full_length]
         self.items, self.validation = training_items(datasets), validation_batches(datasets)
         self.training = batches_by_dataset(self.items, settings)
         self.history: list[dict[str, float]] = []

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from rafl.residual.features import FEATURES
-from rafl.residual.field_kernels import SAVED_ROWS, acceleration_adjoint, local_features, nodal_forces, state_adjoint
+from rafl.residual.field_adjoint import acceleration_adjoint, state_adjoint
+from rafl.residual.field_kernels import SAVED_ROWS, local_features, nodal_forces
 from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]

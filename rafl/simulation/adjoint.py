@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rafl.fem.constitutive_state import DAMPING, ConstitutiveState, HourglassStiffness
 from rafl.fem.enhanced.hourglass import MODES
-from rafl.fem.learned_energy import force_derivatives
+from rafl.fem.learned.energy import force_derivatives
 from rafl.fem.strain import MULTIPLICITY, scatter
 from rafl.simulation.engine import Engine
 from rafl.simulation.simulator import Simulator

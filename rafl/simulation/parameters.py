@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from rafl.fem.laws import LAWS
-from rafl.fem.learned_energy import shared_weights
+from rafl.fem.learned.energy import shared_weights
 from rafl.fem.material import Material, lame
 
 # Ranges of the parameters; the lower bound is left out for those in ABOVE_LOW.

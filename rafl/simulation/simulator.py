@@ -146,7 +146,7 @@ class Simulator:
         return ConstitutiveState(
             parameters.moduli(self.material.law, batch).numpy(),
             hourglass=None if hourglass is None else HourglassStiffness(*hourglass.numpy()),
-            energy_weights=None if energy is None else energy.numpy(),
+            energy_weights=None if energy is None else energy.contiguous().numpy(),  # as the kernels take them
         )
 
     def elastic_gradient(self, q: Array) -> Array:

@@ -22,7 +22,7 @@ from rafl.fem.constitutive_state import ConstitutiveState, HourglassStiffness
 from rafl.fem.enhanced.hourglass import HourglassModes
 from rafl.fem.mesh import HexMesh
 from rafl.fem.quadrature import QuadratureRule
-from rafl.fem.tensors.elements import EnhancedElements, PointElements, TensorElements, of_cells
+from rafl.fem.tensors.elements import CellMotion, EnhancedElements, PointElements, TensorElements, of_cells
 from rafl.simulation.engine import solve_once
 from rafl.solvers.linear import Factors
 from rafl.solvers.tensor_blocks import TensorBlockElimination
@@ -124,14 +124,10 @@ class TorchEngine:
         tangents = at.new_empty(batch if tangent else 0, cells, 24, 24)
         for chunk in self._chunks(batch):
             nodes = self._hexes[chunk]
-            terms = self._elements.terms(
-                at[:, nodes],
-                None if velocity is None else velocity[:, nodes],
-                chunk,
-                of_cells(placed, chunk),
-                tangent=tangent,
-                project=project,
+            own = CellMotion(
+                chunk, at[:, nodes], None if velocity is None else velocity[:, nodes], of_cells(placed, chunk)
             )
+            terms = self._elements.terms(own, tangent=tangent, project=project)
             energy += terms.energy
             forces[:, chunk] = terms.force
             if terms.tangent is not None:

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from rafl.fem.learned_viscosity import learned_viscosity
+from rafl.fem.learned.viscosity import learned_viscosity
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class ViscousMemory:
         strain: Green strains, then hourglass vectors [m], at the latest solution, (B, E, Z).
         earlier_strain, interval: those at the solution before, and the time between the two [s]; None at the start.
         branch_strain: A of every branch at the latest solution, (K, B, E, Z).
-        dissipation: weights of a learned viscosity times mu [Pa], (B, K), see `rafl.fem.learned_viscosity`, or None.
+        dissipation: weights of a learned viscosity times mu [Pa], (B, K), see `rafl.fem.learned.viscosity`, or None.
     """
 
     viscosity: Tensor

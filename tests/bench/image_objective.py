@@ -9,6 +9,7 @@ Compared in space, a marker that one camera sees lies in the plane of the undefo
 
 import argparse
 import shutil
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +21,7 @@ from rich.console import Console
 from scipy.spatial.transform import Rotation
 
 from rafl.calibration.camera import Camera, OrthographicCamera, Plane
-from rafl.calibration.rig import Rig, rig_text
+from rafl.calibration.rig import Rig
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
@@ -33,9 +34,11 @@ from rafl.fitting.methods import METHODS
 from rafl.fitting.run_folder import Settings
 from rafl.simulation.simulator import Simulator
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.reconstruction.gap_filling import MEASURED, MISSING
-from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.tracks import write_tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
+from synthetic_tracks import tracks_of_pixels
 
 SPECIMEN = Path(__file__).parents[2] / "datasets/specimens/canonical.yaml"
 FPS, SIGMA_PX, PIXELS_PER_METRE = 100.0, 0.02, 9000.0
@@ -117,26 +120,8 @@ def write_recordings(
             pixel = own.project(exact) if film is None else film(key, exact)
             pixel = pixel + random.normal(0.0, SIGMA_PX, pixel.shape)
             pixels[key] = CameraPixels(pixel, np.full_like(pixel, SIGMA_PX))
-        position, sigma, residual = triangulate(rig, pixels)
-        frames = len(position)
-        tracks = Tracks(
-            names=markers.names,
-            time=np.arange(frames) / FPS,
-            position=position,
-            sigma=sigma,
-            state=np.where(np.isfinite(position[..., 0]), MEASURED, MISSING).astype(np.uint8),
-            pixel={key: item.pixel for key, item in pixels.items()},
-            residual=residual,
-            pixel_sigma={key: item.sigma for key, item in pixels.items()},
-            damaged={key: np.zeros(frames, bool) for key in pixels},
-            frame={key: np.arange(frames) for key in pixels},
-            images={key: {} for key in pixels},
-            fps=FPS,
-            calibration=rig_text(rig) if with_pixels else "",
-            sources={},
-            settings="",
-        )
-        write_tracks(folder / f"{name}.h5", tracks)
+        tracks = tracks_of_pixels(markers.names, rig, pixels, FPS)
+        write_tracks(folder / f"{name}.h5", tracks if with_pixels else replace(tracks, calibration=""))
         rows.append(RecordingRow(recording=name, load_g=0, split=split))
     return rows
 

@@ -34,7 +34,7 @@ from rafl.fem.mesh import HexMesh
 from rafl.fitting.methods import METHODS
 from rafl.fitting.residual_targets import FORCE_PENALTY, residual_targets
 from rafl.fitting.run_folder import FittedModel, Settings, load_model, load_tensors, write_settings
-from rafl.fitting.train_field import Item, batches_by_dataset, limit_frames, mean_error
+from rafl.fitting.train_field import Item, batches_by_dataset, mean_error
 from rafl.residual.acceleration_field import ResidualField
 from rafl.simulation.simulator import Simulator
 
@@ -134,7 +134,7 @@ class Study:
             names = list(dataset.trajectories)
             targets = residual_targets(Recordings.of(dataset, names), FORCE_PENALTY)
             markers = dataset.markers.positions(torch.from_numpy(targets.q)).numpy()
-            limited = limit_frames(dataset, len(markers))
+            limited = dataset.first_frames(len(markers))
             items = {name: replace(limited.trajectories[name], markers=markers[:, b]) for b, name in enumerate(names)}
             write_dataset(path, replace(limited, name=f"{shape}-softened", trajectories=items))
         return read_dataset(path)

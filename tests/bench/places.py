@@ -8,6 +8,7 @@ and recorded with 0.01 mm of noise. Only E is identified; Poisson's ratio and lo
 
 import argparse
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -27,7 +28,10 @@ from rafl.data.synthetic import loaded_equilibria, simulate_release
 from rafl.fitting.methods import METHODS
 from rafl.fitting.run_folder import Settings
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
+from rafl.tracking.reconstruction.tracks import write_tracks
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
+from synthetic_tracks import tracks_of_positions
 
 LOADS_G = {"train": (30, 60, 75), "val": (45,)}
 FRAMES, FPS = 60, 100.0
@@ -56,10 +60,7 @@ def record(laboratory: Specimen, motion: np.ndarray, folder: Path, seed: int) ->
     for b, row in enumerate(rows):
         exact = markers.positions(torch.from_numpy(motion[:, b])).numpy()
         position = exact + random.normal(0.0, NOISE_SIGMA, exact.shape)
-        state = np.ones(exact.shape[:2], np.uint8)
-        time = np.arange(FRAMES) / FPS
-        sigma = np.full_like(position, NOISE_SIGMA)
-        tracks = Tracks(markers.names, time, position, sigma, state, {}, {}, {}, {}, {}, {}, FPS, "", {}, "")
+        tracks = tracks_of_positions(markers.names, position, NOISE_SIGMA, FPS)
         write_tracks(folder / f"{row.recording}.h5", tracks)
     return rows
 

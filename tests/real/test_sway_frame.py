@@ -78,7 +78,8 @@ class OccludedVideo:
             yield Frame(number / 22.7, image)
 
 
-@pytest.mark.parametrize("downwards", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("downwards", [False, True])
 def test_passing_bar_does_not_change_identities(downwards: bool) -> None:
     """The bar occludes two of seven columns or one of four rows at a time; partly occluded dots get a larger sigma."""
     unoccluded = follow(OccludedVideo(), lambda: None)

@@ -10,15 +10,15 @@ import torch
 from filmed import BIT_TOP, BIT_WIDTH, BITS, Film
 from playwright.sync_api import Browser, Page
 from served import Served
+from synthetic_tracks import tracks_of_pixels
 
 import rafl
-from rafl.calibration.rig import rig_text
 from rafl.capture.rendering.film import side_cameras
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.capture.specimen.specimen import Specimen
 from rafl.tracking.reconstruction.corrected_tracks import read_corrected_tracks
-from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.tracks import read_tracks, write_tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels
 
 Serve = Callable[[Path], str]
 Launch = Callable[[Path], Served]
@@ -324,15 +324,7 @@ def test_swap_made_on_the_page_is_in_the_dataset(
         if camera == "left":
             path[9:, [1, 2]] = path[9:, [2, 1]]
         pixels[camera] = CameraPixels(path, np.where(seen[:, None], 0.02, np.full_like(path, np.nan)))
-    position, sigma, residual = triangulate(rig, pixels)
-    each = {camera: np.zeros(40, bool) for camera in pixels}
-    tracks = Tracks(
-        names=tuple(markers.names), time=0.01 * np.arange(40), position=position, sigma=sigma,
-        state=np.ones(truth.shape[:2], np.uint8), pixel={camera: item.pixel for camera, item in pixels.items()},
-        residual=residual, pixel_sigma={camera: item.sigma for camera, item in pixels.items()}, damaged=each,
-        frame={camera: np.arange(40) for camera in pixels}, images={camera: {} for camera in pixels}, fps=100.0,
-        calibration=rig_text(rig), sources={}, settings="", longest_gap=5,
-    )  # fmt: skip
+    tracks = tracks_of_pixels(tuple(markers.names), rig, pixels, longest_gap=5)
     write_tracks(tmp_path / "tracks/load060g.h5", tracks)
     open_recording(page, serve(tmp_path / "tracks"), "load060g")
     page.keyboard.press("n")

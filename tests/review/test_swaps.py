@@ -5,12 +5,12 @@ from pathlib import Path
 
 import numpy as np
 from filmed import RIG
+from synthetic_tracks import tracks_of_pixels
 
-from rafl.calibration.rig import rig_text
 from rafl.review.tracks.edits import Action, perform
 from rafl.review.tracks.recordings import Library
 from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.triangulation import CameraPixels
 
 ROWS, MARKERS = 10_000, 40
 LIMIT_S = 0.2  # of a processor's time
@@ -41,12 +41,4 @@ def _tracks(random: np.random.Generator) -> Tracks:
     for name, camera in RIG.cameras.items():
         path = camera.project(truth)
         pixels[name] = CameraPixels(path + random.normal(0.0, 0.02, path.shape), np.full_like(path, 0.02))
-    position, sigma, residual = triangulate(RIG, pixels)
-    return Tracks(
-        names=tuple(f"m{k}" for k in range(MARKERS)), time=clock, position=position, sigma=sigma,
-        state=np.ones((ROWS, MARKERS), np.uint8), pixel={name: item.pixel for name, item in pixels.items()},
-        residual=residual, pixel_sigma={name: item.sigma for name, item in pixels.items()},
-        damaged={name: np.zeros(ROWS, bool) for name in pixels}, frame={name: np.arange(ROWS) for name in pixels},
-        images={name: {} for name in pixels}, fps=100.0, calibration=rig_text(RIG), sources={}, settings="",
-        longest_gap=5,
-    )  # fmt: skip
+    return tracks_of_pixels(tuple(f"m{k}" for k in range(MARKERS)), RIG, pixels, longest_gap=5)

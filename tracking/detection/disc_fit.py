@@ -109,9 +109,9 @@ def fit_disc(image, p, near, robust, w, quality):
     explain. w (SCRATCH_SIZE), float32: scratch array.
     """
     start = p.copy()
-    if _fit(image, p, near, robust, w, quality):  # the initial parameters may be wrong instead of the pixels
+    while _fit(image, p, near, robust, w, quality):  # the initial parameters may be wrong instead of the pixels
         p[:] = start
-        _fit(image, p, near, False, w, quality)
+        robust = False  # with which the fit has no unexplained pixels
 
 
 @njit(**FAST)

@@ -3,7 +3,6 @@
 import numpy as np
 from numba import njit, prange
 
-from rafl.fem.elements import add_damping_stress, add_viscous_stress, fill_stress, fill_tangent, project_semidefinite
 from rafl.fem.enhanced.frame import add_frame_stress, add_hourglass_force, fill_frame, fill_kinematics, over_nodes
 from rafl.fem.enhanced.layout import (
     BLOCK,
@@ -20,8 +19,9 @@ from rafl.fem.enhanced.layout import (
 from rafl.fem.enhanced.tangent import fill_block, fill_tensor
 from rafl.fem.kernel_layout import ENERGY, STRESS, WEIGHT
 from rafl.fem.laws.kernel import fill_derivatives
-from rafl.fem.learned_energy_kernel import add_learned_energy
+from rafl.fem.learned.energy_kernel import add_learned_energy
 from rafl.fem.simd import KERNEL_OPTIONS
+from rafl.fem.stress import add_damping_stress, add_viscous_stress, fill_stress, fill_tangent, project_semidefinite
 from rafl.fem.svd import signed_svd_simd
 
 GROUPS_PER_CHUNK = 4  # groups of eight cells in one task of a thread

@@ -21,6 +21,23 @@ from rafl.fem.tensors.stress import Point, Terms, components, damping, elastic, 
 
 
 @dataclass(frozen=True)
+class CellMotion:
+    """What the terms of some cells depend on.
+
+    Attributes:
+        cells: which of the mesh.
+        x: nodal positions [m], (B, C, 8, 3).
+        velocity: of the nodes [m/s], (B, C, 8, 3); None without stiffness damping.
+        state: of these cells, see `of_cells`.
+    """
+
+    cells: slice
+    x: Tensor
+    velocity: Tensor | None
+    state: ConstitutiveState
+
+
+@dataclass(frozen=True)
 class CellTerms:
     """Energy [J] (B), forces [N] (B, C, 8, 3) and, if asked for, tangents [N/m] (B, C, 24, 24)."""
 
@@ -34,17 +51,8 @@ class TensorElements(Protocol):
 
     points: int  # of a cell
 
-    def terms(
-        self,
-        x: Tensor,
-        velocity: Tensor | None,
-        cells: slice,
-        state: ConstitutiveState,
-        *,
-        tangent: bool,
-        project: bool,
-    ) -> CellTerms:
-        """Terms at nodal positions x and velocities (B, C, 8, 3); `state` is that of these cells."""
+    def terms(self, at: CellMotion, *, tangent: bool, project: bool) -> CellTerms:
+        """Terms of the cells; tangents, if asked for, are exact, or positive semi-definite if `project`."""
 
     def strains(self, x: Tensor, direction: Tensor, cells: slice) -> tuple[Tensor, Tensor]:
         """As of `rafl.simulation.engine.Engine.strains`, both (B, C, Z)."""
@@ -73,54 +81,38 @@ class PointElements:
         """Nodal forces (B, C, 8, 3) of stresses times volume (B, C, P, 3, 3)."""
         return self._gradient[cells] @ stress.mT.flatten(2, 3)
 
-    def stress(
-        self,
-        x: Tensor,
-        velocity: Tensor | None,
-        cells: slice,
-        state: ConstitutiveState,
-        tangent: bool,
-        project: bool,
-    ) -> tuple[Point, Terms]:
+    def stress(self, at: CellMotion, tangent: bool, project: bool) -> tuple[Point, Terms]:
         """Energy, stress and tangent at the points, times their volume."""
-        point = Point.of(self.gradients(x, cells))
+        state = at.state
+        point = Point.of(self.gradients(at.x, at.cells))
         terms = elastic(self.law, point, self._shares, state, tangent, project)
         if state.memory is not None:
             assert state.viscous_modulus is not None
             own = self._shares[:, 0]
             terms = terms + viscous(point, own, state.viscous_modulus, state.memory, tangent, project)
-        if velocity is not None:
-            rate = self.gradients(velocity, cells)
+        if at.velocity is not None:
+            rate = self.gradients(at.velocity, at.cells)
             terms = terms + damping(rate, self._shares, state.moduli, state.velocity_factor, tangent)
-        volume = self._volume[cells]
+        volume = self._volume[at.cells]
         return point, Terms(
             terms.energy * volume,
             terms.stress * volume[..., None, None],
             None if terms.tangent is None else terms.tangent * volume[..., None, None],
         )
 
-    def terms(
-        self,
-        x: Tensor,
-        velocity: Tensor | None,
-        cells: slice,
-        state: ConstitutiveState,
-        *,
-        tangent: bool,
-        project: bool,
-    ) -> CellTerms:
-        """Terms at nodal positions x and velocities (B, C, 8, 3); `state` is that of these cells."""
-        _, terms = self.stress(x, velocity, cells, state, tangent, project)
+    def terms(self, at: CellMotion, *, tangent: bool, project: bool) -> CellTerms:
+        """Terms of the cells; tangents, if asked for, are exact, or positive semi-definite if `project`."""
+        _, terms = self.stress(at, tangent, project)
         cell_tangent = None
         if terms.tangent is not None:
-            batch, count = x.shape[:2]
-            gradient = self._gradient[cells]
+            batch, count = at.x.shape[:2]
+            gradient = self._gradient[at.cells]
             by_point = gradient.reshape(-1, 8, self.points, 3).permute(0, 2, 3, 1)  # (C, P, 3, 8)
             half = terms.tangent.reshape(batch, count, self.points, 27, 3) @ by_point
             half = half.reshape(batch, count, self.points, 3, 3, 24).transpose(3, 4)  # .., j, i, k and node
             flat = gradient @ half.reshape(batch, count, 3 * self.points, 72)
             cell_tangent = flat.reshape(batch, count, 24, 3, 8).transpose(-1, -2).reshape(batch, count, 24, 24)
-        return CellTerms(terms.energy.sum((1, 2)), self.nodal(terms.stress, cells), cell_tangent)
+        return CellTerms(terms.energy.sum((1, 2)), self.nodal(terms.stress, at.cells), cell_tangent)
 
     def strains(self, x: Tensor, direction: Tensor, cells: slice) -> tuple[Tensor, Tensor]:
         """Green strains, and their change along a direction."""
@@ -155,21 +147,13 @@ class EnhancedElements:
         """Stiffness (B, U, 12, 12) of the shapes, by cell (B, C or 1, 12, 12)."""
         return stiffness if stiffness.shape[1] == 1 else stiffness[:, self._shape_index[cells]]
 
-    def terms(
-        self,
-        x: Tensor,
-        velocity: Tensor | None,
-        cells: slice,
-        state: ConstitutiveState,
-        *,
-        tangent: bool,
-        project: bool,
-    ) -> CellTerms:
-        """Terms at nodal positions x and velocities (B, C, 8, 3); `state` is that of these cells."""
+    def terms(self, at: CellMotion, *, tangent: bool, project: bool) -> CellTerms:
+        """Terms of the cells; tangents, if asked for, are exact, or positive semi-definite if `project`."""
+        state, cells = at.state, at.cells
         assert state.hourglass is not None
-        gamma, shape = self._gamma[cells], x.shape[:2]
-        point, terms = self._mean.stress(x, velocity, cells, state, tangent, project)
-        frame = HourglassFrame.of(point, gamma @ x)
+        gamma, shape = self._gamma[cells], at.x.shape[:2]
+        point, terms = self._mean.stress(at, tangent, project)
+        frame = HourglassFrame.of(point, gamma @ at.x)
         elastic_part, viscous_part = (
             self._of_cells(part, cells) for part in (state.hourglass.elastic, state.hourglass.viscous)
         )
@@ -179,9 +163,9 @@ class EnhancedElements:
         total = terms.energy.sum((1, 2)) + energy.sum(1)
         on_gradient, on_vectors = frame.forces(force)
         whole = frame.tangent(stiffness.expand(*shape, MODES, MODES), force, project) if tangent else None
-        if velocity is not None:
+        if at.velocity is not None:
             damped = self._of_cells(state.hourglass.damping, cells)
-            rate = (gamma @ velocity).flatten(-2)
+            rate = (gamma @ at.velocity).flatten(-2)
             along = (damped @ rate[..., None])[..., 0]
             total = total + 0.5 / state.velocity_factor * (rate * along).sum((1, 2))
             on_vectors = on_vectors + along.reshape(*shape, 4, 3)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from rafl.fem.constitutive_state import DAMPING, ConstitutiveState
 from rafl.fem.laws import LAWS
-from rafl.fem.learned_energy import reference_learned_energy
+from rafl.fem.learned.energy import reference_learned_energy
 from rafl.fem.tensors.constants import indices
 from rafl.fem.tensors.svd import signed_svd
 

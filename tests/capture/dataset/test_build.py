@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
+from synthetic_tracks import tracks_of_positions
 
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.settings import CaptureSettings
@@ -20,7 +21,7 @@ from rafl.data.dataset_file import read_dataset, update_dataset, write_dataset
 from rafl.data.synthetic import load_force
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.reconstruction.export import WRITERS, export_name
-from rafl.tracking.reconstruction.tracks import Tracks, read_tracks, write_tracks
+from rafl.tracking.reconstruction.tracks import read_tracks, write_tracks
 
 SETTINGS = CaptureSettings()
 FRAMES = 8
@@ -220,25 +221,8 @@ def test_the_state_of_the_first_frame_is_found(small_specimen: Specimen, tmp_pat
 
 def write_q0_tracks(specimen: Specimen, folder: Path, position: np.ndarray, sigma: np.ndarray) -> None:
     """Write q0.h5 with every marker measured."""
-    time, state = 0.01 * np.arange(FRAMES), np.ones(position.shape[:2], dtype=np.uint8)
-    tracks = Tracks(
-        specimen.layout.names,
-        time,
-        position,
-        sigma,
-        state,
-        {},
-        {},
-        {},
-        {},
-        {},
-        {},
-        100.0,
-        "",
-        {"v.mp4": "0"},
-        "",
-    )
-    write_tracks(folder / "q0.h5", tracks)
+    tracks = tracks_of_positions(specimen.layout.names, position, sigma)
+    write_tracks(folder / "q0.h5", replace(tracks, sources={"v.mp4": "0"}))
 
 
 def test_tracks_need_no_registration_but_must_be_in_the_specimen_frame(

@@ -9,8 +9,9 @@ import torch
 from filmed_markers import PIXELS_PER_METRE, side_camera
 from late_rig import film, track
 from scipy.interpolate import CubicSpline, make_interp_spline
+from synthetic_tracks import tracks_of_pixels
 
-from rafl.calibration.rig import Rig, rig_text
+from rafl.calibration.rig import Rig
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.camera_summary import camera_rows, camera_warnings
 from rafl.capture.dataset.refine_cameras import Refinement
@@ -23,9 +24,8 @@ from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset, write_dataset
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.reconstruction.gap_filling import MEASURED, MISSING
-from rafl.tracking.reconstruction.tracks import Tracks, write_tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.tracks import write_tracks
+from rafl.tracking.reconstruction.triangulation import CameraPixels
 
 FRAMES, STILL, SIGMA_PX, STEP = 24, 6, 0.02, 0.01
 LATE = 0.3  # of the right camera's clock [frames]
@@ -64,28 +64,7 @@ def write_swing(folder: Path, specimen: Specimen, motion: np.ndarray, late: floa
         exact = markers.positions(torch.from_numpy(path(np.maximum(time, 0.0)))).numpy()
         pixel = camera.project(exact) + random.normal(0.0, SIGMA_PX, (*exact.shape[:2], 2))
         pixels[name] = CameraPixels(pixel, np.full_like(pixel, SIGMA_PX))
-    rig = Rig(dict(CALIBRATED))
-    position, sigma, residual = triangulate(rig, pixels)
-    write_tracks(
-        folder / "swing.h5",
-        Tracks(
-            names=markers.names,
-            time=STEP * np.arange(len(motion)),
-            position=position,
-            sigma=sigma,
-            state=np.where(np.isfinite(position[..., 0]), MEASURED, MISSING).astype(np.uint8),
-            pixel={name: item.pixel for name, item in pixels.items()},
-            residual=residual,
-            pixel_sigma={name: item.sigma for name, item in pixels.items()},
-            damaged={name: np.zeros(len(motion), bool) for name in pixels},
-            frame={name: np.arange(len(motion)) for name in pixels},
-            images={name: {} for name in pixels},
-            fps=1.0 / STEP,
-            calibration=rig_text(rig),
-            sources={},
-            settings="",
-        ),
-    )
+    write_tracks(folder / "swing.h5", tracks_of_pixels(markers.names, Rig(dict(CALIBRATED)), pixels, 1.0 / STEP))
 
 
 def built(folder: Path, specimen: Specimen, refine: bool, row: RecordingRow = ROW) -> Dataset:

@@ -63,7 +63,7 @@ def rubber(small_specimen: Specimen) -> Dataset:
         replace(small_specimen.simulator(0.01, each), integrator="generalised-alpha") for each in (assumed, target)
     )
     starts = loaded_equilibria(lab, small_specimen.mesh.face_nodes("x-max"), LOADS)
-    return release_dataset("small", base, lab, starts, 30, SPLITS)
+    return release_dataset("small", base, lab, starts, 20, SPLITS)
 
 
 def test_default_fit_predicts_left_out_recordings(rubber: Dataset, tmp_path: Path) -> None:

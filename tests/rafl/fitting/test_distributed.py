@@ -145,6 +145,14 @@ def test_error_of_the_user_is_printed_once(options: tuple[str, ...], part: str, 
     assert error_lines(second.stderr) == []
 
 
+def test_option_that_cannot_be_read_is_reported_once(folder: Path) -> None:
+    first, second = run_together(2, folder, "rafl-fit", "a.h5", "--epochs", "many")
+    assert first.returncode == 2
+    assert "Invalid value for '--epochs'" in first.stderr
+    assert second.returncode != 0
+    assert error_lines(second.stderr) == []
+
+
 def test_interruption_ends_all_processes(folder: Path) -> None:
     """As torchrun does after Ctrl-C, all get a signal, wherever they are."""
     run = folder / "interrupted"

@@ -26,7 +26,6 @@ from rafl.fitting.supervised import fit_supervised
 from rafl.fitting.sysid import identify_material, parameter_sentences
 from rafl.fitting.train_field import (
     fit_residual_field,
-    limit_frames,
     mean_error,
     pretraining_unavailable,
     training_items,
@@ -191,7 +190,7 @@ def test_fine_tuning_begins_with_pretraining(dataset: Dataset, tmp_path: Path) -
     first = fit_residual_field([dataset], replace(SETTINGS, epochs=1, frames=6), tmp_path / "a", ignore)
     other = with_material(dataset.simulator, 300e3, 0.3)
     changed = replace(dataset, simulator=other)
-    initial = 1e3 * mean_error(validation_batches([limit_frames(changed, 6)]), first)
+    initial = 1e3 * mean_error(validation_batches([changed.first_frames(6)]), first)
     rows: list[dict[str, float]] = []
     settings = replace(SETTINGS, epochs=1, frames=6, start=str(tmp_path / "a"), warm_start=3)
     fit_residual_field([changed], settings, tmp_path / "b", rows.append)

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 
 from rafl.fem.constitutive_state import ConstitutiveState, HourglassStiffness
 from rafl.fem.laws import LAWS
-from rafl.fem.learned_energy import UNITS as ENERGY_UNITS
-from rafl.fem.learned_viscosity import UNITS as VISCOSITY_UNITS
+from rafl.fem.learned.energy import UNITS as ENERGY_UNITS
+from rafl.fem.learned.viscosity import UNITS as VISCOSITY_UNITS
 from rafl.fem.material import INTEGRATION_SCHEMES, Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation import torch_engine

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 
-from rafl.fem.learned_energy import UNITS as ENERGY_UNITS
-from rafl.fem.learned_energy import shared_weights
-from rafl.fem.learned_viscosity import UNITS as VISCOSITY_UNITS
+from rafl.fem.learned.energy import UNITS as ENERGY_UNITS
+from rafl.fem.learned.energy import shared_weights
+from rafl.fem.learned.viscosity import UNITS as VISCOSITY_UNITS
 from rafl.fem.material import Material
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.rollout import Start, equilibrium, rollout, simulate_steps
@@ -44,6 +44,13 @@ def deformed(simulator: Simulator, seed: int, size: float = 3e-3) -> np.ndarray:
         0, size, (2, *simulator.mesh.vertices.shape)
     )
     return q
+
+
+def test_weights_are_as_the_kernels_take_them() -> None:
+    """For an array of another layout all kernels would be compiled again."""
+    weights = beam(learned_material(0)).constitutive_state(3).energy_weights
+    assert weights is not None
+    assert weights.flags.c_contiguous
 
 
 @SCHEMES

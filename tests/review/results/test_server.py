@@ -69,7 +69,8 @@ def test_page_is_served_under_the_strict_policy(client: TestClient) -> None:
         assert answer.text == static_text(f"results/{name}.js")
         assert "innerHTML" not in answer.text
         assert "http" not in answer.text
-    for name in ("three/three.module.min.js", "uplot/uPlot.esm.js", "results/results.css", "icon.svg"):
+    styles = ("page/page.css", "results/results.css")
+    for name in ("three/three.module.min.js", "uplot/uPlot.esm.js", *styles, "icon.svg"):
         assert client.get(f"/static/{name}").status_code == 200
     for library in ("three", "uplot"):
         assert "MIT License" in static_text(f"{library}/LICENSE").replace("The MIT", "MIT")

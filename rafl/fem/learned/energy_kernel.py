@@ -1,10 +1,10 @@
-"""Compiled derivatives of the learned strain energy; see `rafl.fem.learned_energy`."""
+"""Compiled derivatives of the learned strain energy; see `rafl.fem.learned.energy`."""
 
 import numpy as np
 from numba import njit
 
 from rafl.fem.kernel_layout import ENERGY, FIRST, FLIP, SECOND, STRETCH
-from rafl.fem.learned_energy import KINDS, SCALES
+from rafl.fem.learned.energy import KINDS, SCALES
 from rafl.fem.simd import KERNEL_OPTIONS
 
 
