@@ -36,9 +36,7 @@ def draw_description(description: Description, title: str) -> bytes:
             quads = 1e3 * on_face(face, points[mesh.surface].reshape(-1, 3)).reshape(-1, 4, 2)
             axes.add_collection(PolyCollection(list(quads), facecolor=colours[0], edgecolor=colours[1], linewidth=0.4))
         own = faces == face
-        recorded, rest = (
-            1e3 * on_face(face, points[own]) for points in (description.dots.position, found.carried.rest)
-        )
+        recorded, rest = (1e3 * on_face(face, points[own]) for points in (found.carried.position, found.carried.rest))
         axes.add_collection(LineCollection(list(np.stack([recorded, rest], axis=1)), color="#c0392b", linewidth=0.8))
         axes.plot(*recorded.T, "o", markersize=2.5, color="#c0392b")
         axes.plot(*rest.T, "o", markersize=4, color="#1f4e79")

@@ -49,6 +49,7 @@ class Carried:
     """Dots carried back from the deformed to the undeformed body.
 
     Attributes:
+        position: of the dots [m], (M, 3), as recorded, or where the line of sight passes the body if one camera saw it.
         rest: places on the undeformed body [m], (M, 3).
         normal: its outward normal there, (M, 3).
         gap: from the points of the deformed body to the dots, in the directions that were measured [m], (M, 3).
@@ -59,6 +60,7 @@ class Carried:
         sigma: standard deviation of the places on the body that follows from those of the dots [m], (M).
     """
 
+    position: Array
     rest: Array
     normal: Array
     gap: Array
@@ -106,7 +108,7 @@ def carry_back(shape: Shape, q: Array, dots: Dots) -> Carried:
     by_tangent = tangents.swapaxes(1, 2) @ (dots.precision() + unknown) @ tangents
     covariance = rest_tangents @ np.linalg.inv(by_tangent) @ rest_tangents.swapaxes(1, 2)
     sigma = np.sqrt(np.linalg.eigvalsh(covariance)[:, -1])
-    return Carried(rest, normal, gap, axes[..., 2], distance, deflection, sigma)
+    return Carried(point + gap, rest, normal, gap, axes[..., 2], distance, deflection, sigma)
 
 
 def _nearest_points(mesh: HexMesh, q: Array, dots: Dots) -> tuple[NDArray[np.int64], Array]:

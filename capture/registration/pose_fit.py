@@ -1,7 +1,7 @@
 """Fits of poses to markers that were measured along some directions each."""
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -156,8 +156,8 @@ def _candidate_distances(measured: Measured, layout: Array) -> Array:
     pose = kabsch(every.position, layout, chosen.astype(float))
     if measured.has_depths:
         return every.distances(pose, layout)
-    part = replace(every, position=np.where(chosen[..., None], every.position, np.nan))
-    by_triple = every.distances(_search(part, layout, pose, pose).pose, layout)
+    part = Measured(measured.position[0, triples], measured.axes[0, triples], measured.sigma[0, triples])
+    by_triple = every.distances(_search(part, layout[triples], pose, pose).pose, layout)
     return np.concatenate([by_triple, measured.distances(_fit(measured, layout).pose, layout)])
 
 
@@ -254,7 +254,10 @@ def _choose(fits: list[_Fits], near: RigidTransform) -> _Fits:
 
 
 def _search(measured: Measured, layout: Array, start: RigidTransform, near: RigidTransform) -> _Fits:
-    """Levenberg-Marquardt from K poses `start`, with a prior around the poses `near`."""
+    """Levenberg-Marquardt from K poses `start`, with a prior around the poses `near`.
+
+    layout: layout positions [m], (M, 3), or of each set, (K, M, 3).
+    """
     weight, pose = measured.weight, start
     middle = (np.any(weight > 0.0, axis=2)[..., None] * layout).sum(axis=1) / measured.seen.sum(axis=1)[:, None]
     by_pose = pose_jacobian(layout)

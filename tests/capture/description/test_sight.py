@@ -103,7 +103,7 @@ def test_a_dot_lies_on_the_side_that_its_camera_sees() -> None:
         dots = Dots(("a", "b"), own + 2.5e-3 * sign * away, np.broadcast_to(seen, (2, 3, 3)), sigma)
         carried = carry_back(Shape(mesh), mesh.vertices, dots)
         np.testing.assert_allclose(carried.rest, own, atol=1e-6)
-        np.testing.assert_allclose(carried.gap, 0.0, atol=1e-6)
+        np.testing.assert_allclose(carried.position, own, atol=1e-6)
         np.testing.assert_allclose(carried.sigma, 1e-5 / np.cos(0.4), rtol=1e-3)  # the face is oblique
 
 
