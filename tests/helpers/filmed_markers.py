@@ -5,13 +5,14 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from synthetic_tracks import tracks_of_pixels
 
 from rafl.calibration.camera import Camera, OrthographicCamera, PinholeCamera
-from rafl.calibration.rig import Rig, rig_text
+from rafl.calibration.rig import Rig
 from rafl.data.dataset import Dataset, Trajectory
 from rafl.data.views import View
 from rafl.tracking.reconstruction.tracks import Tracks
-from rafl.tracking.reconstruction.triangulation import CameraPixels, triangulate
+from rafl.tracking.reconstruction.triangulation import CameraPixels
 
 SIZE = (1280, 720)
 PIXELS_PER_METRE = 8000.0
@@ -106,28 +107,9 @@ def filmed_tracks(
         noise: their errors [px], (T, M, 2).
         seen: which markers each camera sees, (M); all if None.
     """
-    pixels, frames = {}, len(exact)
+    pixels = {}
     for name, camera in cameras.items():
         kept = np.ones(len(names), bool) if seen is None else seen[name]
         pixel = np.where(kept[:, None], camera.project(exact) + noise, np.nan)
         pixels[name] = CameraPixels(pixel, np.where(np.isfinite(pixel), sigma, np.nan))
-    rig = Rig(dict(cameras))
-    position, position_sigma, residual = triangulate(rig, pixels)
-    return Tracks(
-        names=names,
-        time=np.arange(frames) / 100.0,
-        position=position,
-        sigma=position_sigma,
-        state=np.isfinite(position[..., 0]).astype(np.uint8),
-        pixel={name: item.pixel for name, item in pixels.items()},
-        residual=residual,
-        pixel_sigma={name: item.sigma for name, item in pixels.items()},
-        damaged={name: np.zeros(frames, bool) for name in pixels},
-        frame={name: np.arange(frames) for name in pixels},
-        images={name: {} for name in pixels},
-        fps=100.0,
-        calibration=rig_text(rig),
-        sources={},
-        settings="",
-        longest_gap=5,
-    )
+    return tracks_of_pixels(names, Rig(dict(cameras)), pixels, longest_gap=5)
