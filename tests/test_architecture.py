@@ -39,6 +39,7 @@ INSIDE = {
         "report",
         "rendering|description",
         "dataset",
+        "release",
         "registration",
         "specimen",
     ],

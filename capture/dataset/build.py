@@ -19,7 +19,6 @@ from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.initial import InitialState, fit_first_frame, fit_velocity
-from rafl.capture.registration.motion_start import MotionStart
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import (
     Registration,
@@ -28,6 +27,7 @@ from rafl.capture.registration.registration import (
     register,
 )
 from rafl.capture.registration.sequence import fit_by_sequence
+from rafl.capture.release.motion_start import MotionStart
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import MAX_RELATIVE_TIME_ERROR, Dataset, Trajectory

@@ -11,11 +11,11 @@ from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.averaging import average_frames, average_views
 from rafl.capture.registration.camera_change import CameraChange, positions_at, without_lag
 from rafl.capture.registration.first_frame import FirstFrame
-from rafl.capture.registration.motion_start import MotionStart, find_motion_start
 from rafl.capture.registration.places import Places, find_places
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.registration import Registration, fit_pose_near_clamp
 from rafl.capture.registration.rigid import IDENTITY, MIN_MARKERS, RigidTransform, pose_sigma
+from rafl.capture.release.motion_start import MotionStart, find_motion_start
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from rafl.capture.registration.averaging import average_recording
 from rafl.capture.registration.recording import Recording
-from rafl.capture.registration.release import REST_NOISE_FACTOR, find_release
 from rafl.capture.registration.rigid import MIN_MARKERS, RigidTransform
+from rafl.capture.release.release import REST_NOISE_FACTOR, find_release
 from rafl.common.errors import InputError
 
 Array = NDArray[Any]

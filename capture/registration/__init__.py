@@ -1,1 +1,1 @@
-"""Registration of recordings to the specimen: rigid transforms, the release, the first frame."""
+"""Registration of recordings to the specimen: poses, places of the markers, the first frame."""

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rafl.capture.registration.release import Release, find_release
+from rafl.capture.release.release import Release, find_release
 from rafl.capture.rendering.motion import tip_load_release
 from rafl.capture.specimen.specimen import Specimen
 

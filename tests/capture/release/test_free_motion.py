@@ -7,7 +7,7 @@ import pytest
 import torch
 from swings import bent, slack_string, swing, touching_load
 
-from rafl.capture.registration.free_motion import FreeMotion
+from rafl.capture.release.free_motion import FreeMotion
 from rafl.capture.rendering.motion import tip_load_release, twist_release
 from rafl.capture.specimen.specimen import Specimen
 

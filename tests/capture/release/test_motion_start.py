@@ -6,7 +6,7 @@ from support import SHARED
 from swings import bent, joined, slack_string, swing, touching_load
 
 from rafl.capture.dataset.sources import read_recording
-from rafl.capture.registration.motion_start import MotionStart, find_motion_start
+from rafl.capture.release.motion_start import MotionStart, find_motion_start
 
 GAP, BEAM = SHARED / "cases" / "c3d-gap-after-release" / "in", SHARED / "real" / "clamped_beam"
 HELD = np.full(31, -0.02)  # 30 frames at rest, and the first of the motion

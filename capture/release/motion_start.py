@@ -5,8 +5,8 @@ from typing import Any, Literal
 
 from numpy.typing import NDArray
 
-from rafl.capture.registration.free_motion import FreeMotion
-from rafl.capture.registration.release import find_release
+from rafl.capture.release.free_motion import FreeMotion
+from rafl.capture.release.release import find_release
 
 Array = NDArray[Any]
 
