@@ -19,7 +19,7 @@ Array = NDArray[Any]
 
 # A load hangs from the free end, and practically only its force and moment act; or a hand holds the end, so that it
 # hardly deforms, under any forces; or forces are local, and dent the mesh.
-HUNG, HELD = ForcePrior("a hanging load", 1e-5), ForcePrior("a held end", 10.0, shape_sigma=1e-5)
+HUNG, HELD = ForcePrior("hanging load", 1e-5), ForcePrior("held end", 10.0, shape_sigma=1e-5)
 LOCAL = tuple(ForcePrior("local forces", sigma) for sigma in (5e-3, 5e-2, 0.5))
 SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act on the whole surface
 REFITS = 5  # at most, with the model's error that the last fit left
