@@ -22,6 +22,7 @@ Array = NDArray[Any]
 HUNG, HELD = ForcePrior("hanging load", 1e-5), ForcePrior("held end", 10.0, shape_sigma=1e-5)
 LOCAL = tuple(ForcePrior("local forces", sigma) for sigma in (5e-3, 5e-2, 0.5))
 SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act on the whole surface
+MODEL_FRACTION = 0.01  # of the deflection, that a mesh is assumed to follow a bent specimen to
 REFITS = 5  # at most, with the model's error that the last fit left
 SETTLED = 1.2  # ratio of standard deviations of the observation in successive fits; a smaller one ends the refits
 HANGING_ODDS = 3.0  # logarithm of how much likelier a hanging load is beforehand than forces of another kind
@@ -79,9 +80,8 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
         # The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose
         # would: the two can hardly be told apart.
         with_modulus = not with_pose
-        first = ForceSearch(frame, HUNG, 0.0, with_pose, with_modulus)
-        hung = first.minimise(zero, pose or IDENTITY, None)
-        search, best = _choose(first, hung)
+        first = ForceSearch(frame, HUNG, _assumed_error(frame, pose), with_pose, with_modulus)
+        search, best = _choose(first, first.minimise(zero, pose or IDENTITY, None))
         if with_modulus:
             marker_sigma[frame.measured] = search.marker_sigma(best)
     weight = frame.simulator.weight
@@ -90,16 +90,26 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     return InitialState(best.q, force, np.sqrt(3.0) * search.rms(best), best.pose, marker_sigma, search.prior.name)
 
 
+def _assumed_error(frame: FirstFrame, pose: RigidTransform | None) -> float:
+    """The error of the mesh from which the search starts [m], by the deflection that was measured.
+
+    Without it, a mesh that cannot match the markers would be bent by forces and a modulus out of all proportion.
+    """
+    target = frame.target[frame.measured] if pose is None else pose.apply(frame.target[frame.measured])
+    moved = frame.along_axes(target - frame.markers.rest[frame.measured])[frame.observed_axes]
+    return MODEL_FRACTION * float(np.sqrt((moved**2).mean()))
+
+
 def _choose(first: ForceSearch, found: Estimate) -> tuple[ForceSearch, Estimate]:
     """The most probable fit; forces that dent the mesh are tried only if no others explain the observation.
 
-    first, found: the fit to a hanging load, of a mesh without error.
+    first, found: the fit to a hanging load, of a mesh with the error that is assumed.
     """
-    fits = [(first, found), _refit(first, HELD, found)]
+    fits = [_refit(first, HUNG, found), _refit(first, HELD, found)]
     search, best = _most_probable(fits)
     if search.residual_sigmas(best) < EXPLAINED:
         return search, best
-    return _most_probable([*fits, *(_refit(first, prior, found) for prior in (HUNG, *LOCAL))])
+    return _most_probable([*fits, *(_refit(first, prior, found) for prior in LOCAL)])
 
 
 def _most_probable(fits: list[tuple[ForceSearch, Estimate]]) -> tuple[ForceSearch, Estimate]:
