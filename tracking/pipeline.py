@@ -126,6 +126,7 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
     frame = {camera: shown_frames(time, clock) for camera, time in rig_times.items()}
     pixels = {camera: resample_pixels(item, rig_times[camera], clock) for camera, item in in_order.items()}
     apart = [camera for camera, time in rig_times.items() if not coincide(time, clock)]
+    notes += [_late_note(camera, rig_times[camera], clock, frame[camera]) for camera in apart]
     position, sigma, residual = triangulate(rig, pixels)
     notes += [note for camera in in_order for note in _perspective_note(rig, camera, position)]
     position, sigma, state = fill_gaps(position, sigma, clock, settings.fill)
@@ -170,6 +171,16 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         filmed_pixel={camera: in_order[camera].pixel for camera in apart},
         filmed_sigma={camera: in_order[camera].sigma for camera in apart},
         longest_gap=settings.fill,
+    )
+
+
+def _late_note(camera: str, time: Array, clock: Array, frame: NDArray[np.int64]) -> str:
+    """A note on a camera that films at other times [s] than the rows, of which each shows a frame, or none (-1)."""
+    shown = frame >= 0
+    late = 1e3 * float(np.median(time[frame[shown]] - clock[shown]))
+    return (
+        f"camera {camera}: films {late:+.3f} ms from the times of the tracks; its dots are interpolated there, and "
+        "kept as filmed too"
     )
 
 

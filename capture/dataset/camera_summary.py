@@ -20,6 +20,7 @@ MAX_SIGMAS = 3.0  # a larger change of the pixels is more than the calibration's
 # Squared length of a change of the pose, in standard deviations, that is exceeded by chance as rarely as 3 sigmas: of a
 # chi-squared distribution of six degrees of freedom.
 MAX_SQUARED_LENGTH = 20.1
+LEAST_CLOCK_ERROR = 0.05  # that is worth a warning [frames]
 
 
 @dataclass(frozen=True)
@@ -32,6 +33,7 @@ class CameraRow:
         pixels: root mean square change of the markers' pixels at rest, the calibration's own uncertainty of them, and
             what the model leaves unexplained.
         touched: whether the change is more than the calibration's uncertainty.
+        late: what to add to `time_offset_s` [s] if the clock differs from its calibration; empty otherwise.
         doubt: why the camera's or the body's model is in doubt; empty if what it leaves unexplained is as expected.
     """
 
@@ -41,6 +43,7 @@ class CameraRow:
     clock: str
     pixels: str
     touched: bool
+    late: str
     doubt: str
 
 
@@ -120,10 +123,18 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
                 _pairs(frames * value[CLOCK:], frames * sigma[CLOCK:]),
                 f"{moved:.3g} +- {moved_sigma:.2g}{known}, {unexplained:.2g} unexplained",
                 _touched(moved, own, length),
+                f"{value[CLOCK]:+.6f} +- {sigma[CLOCK]:.1g}"
+                if _off(frames * value[CLOCK], frames * sigma[CLOCK])
+                else "",
                 doubt if unexplained > MAX_SIGMAS * expected else "",
             )
         )
     return rows
+
+
+def _off(clock: float, sigma: float) -> bool:
+    """Whether a clock differs from its calibration [frames]."""
+    return abs(clock) > max(LEAST_CLOCK_ERROR, MAX_SIGMAS * sigma)
 
 
 def _pairs(values: Array, sigmas: Array) -> str:
@@ -131,7 +142,7 @@ def _pairs(values: Array, sigmas: Array) -> str:
 
 
 def camera_warnings(dataset: Dataset) -> list[str]:
-    """A line for every camera that was touched, and for every one that the model does not explain."""
+    """A line for every camera that was touched or has another clock, and for every one that no model explains."""
     rows = camera_rows(dataset)
     doubts = [
         f"camera {row.camera}: the simulated motion is {row.doubt} from the recorded one, whatever the material and "
@@ -140,7 +151,13 @@ def camera_warnings(dataset: Dataset) -> list[str]:
         for row in rows
         if row.doubt
     ]
-    return doubts + [
+    clocks = [
+        f"camera {row.camera}: its clock was found off; the dataset has the one found. Add {row.late} s to its "
+        "time_offset_s in calib.yaml before the next recording"
+        for row in rows
+        if row.late
+    ]
+    return [*doubts, *clocks] + [
         f"camera {row.camera}: found turned by {row.turn} degrees about x, y and z since its calibration, and shifted "
         f"by {row.shift} mm; it was touched, or the body is not as the model has it. The dataset has the camera where "
         "it was found; calibrate again before the next recording"

@@ -136,7 +136,10 @@ def test_changes_are_reported_and_kept(datasets: tuple[Dataset, Dataset], tmp_pa
     rows = {row.camera: row for row in camera_rows(read_dataset(tmp_path / "beam.h5"))}
     assert rows["right"].touched
     assert not rows["left"].touched
-    (line,) = camera_warnings(datasets[1])
+    clock, line = camera_warnings(datasets[1])
+    assert clock.startswith("camera right: its clock was found off")
+    found = float(clock.split("Add ")[1].split()[0])  # [s]
+    assert abs(found / STEP) == pytest.approx(0.3, abs=0.01)
     assert line.startswith("camera right: ")
     assert "calibrate again" in line
     assert camera_rows(datasets[0]) == []
