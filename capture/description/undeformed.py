@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from rafl.capture.description.naming import dots_by_row, faces_of
 from rafl.capture.description.still import Dots
+from rafl.capture.registration.first_frame import MODEL_FRACTION
 from rafl.capture.registration.force_search import MODULUS_SIGMA
 from rafl.capture.registration.places import (
     MAX_ITERATIONS,
     MAX_MODULUS_STEP,
     MIN_MODEL_SIGMA,
-    MODEL_FRACTION,
 )
 from rafl.data.markers import Markers, embed
 from rafl.fem.mesh import HexMesh

@@ -15,6 +15,8 @@ RESULTANT_SIGMA = 1.0  # of the amplitudes of the modes of a force and a moment 
 # Of the force of a known load, as a share of its weight: a string within three degrees of the vertical.
 LOAD_SIGMA = 0.05
 HANGING_SIGMA = 3e-3  # distance of the place where the load hangs from the middle of its nodes [m]
+# The mesh follows the shape of a bent specimen to about this fraction of its deflection.
+MODEL_FRACTION = 0.01
 LEAST_ARM = 1e-3  # of nodes about an axis, relative to the largest; with less, they are in line with it
 UNOBSERVED_SIGMA_FACTOR = 10.0  # a larger multiple of the median sigma marks an axis that no camera observed
 

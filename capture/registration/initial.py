@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rafl.capture.registration.first_frame import FirstFrame
+from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
 from rafl.capture.registration.force_search import (
     Estimate,
     ForcePrior,
@@ -18,17 +18,16 @@ from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 Array = NDArray[Any]
 
 # A load hangs from the free end, and practically only its force and moment act; or a hand holds the end, so that it
-# hardly deforms, under any forces; or forces are local, and dent the mesh.
+# hardly deforms (by 10 um, as little as a first frame tells), under any forces; or forces are local, and dent the mesh.
 HUNG, HELD = ForcePrior("hanging load", 1e-5), ForcePrior("held end", 10.0, shape_sigma=1e-5)
 LOCAL = tuple(ForcePrior("local forces", sigma) for sigma in (5e-3, 5e-2, 0.5))
 SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act on the whole surface
-MODEL_FRACTION = 0.01  # of the deflection, that a mesh is assumed to follow a bent specimen to
 REFITS = 5  # at most, with the model's error that the last fit left
 SETTLED = 1.2  # ratio of standard deviations of the observation in successive fits; a smaller one ends the refits
 HANGING_ODDS = 3.0  # logarithm of how much likelier a hanging load is beforehand than forces of another kind
 EXPLAINED = 1.2  # root mean square residual over sigma of a fit that leaves nothing for other forces to explain
-FORCE_CHANGE = LOCAL[0]  # while the body moves
-FORCE_CHANGE_RATE = 60.0  # 1/s: forces change as in an oscillation of about 10 Hz
+FORCE_CHANGE = LOCAL[0]  # prior of the forces whose change gives the velocity of a body in motion
+FORCE_CHANGE_RATE = 60.0  # 1/s: they change as in an oscillation of about 10 Hz
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rafl.capture.registration.first_frame import FirstFrame
+from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
 from rafl.capture.registration.force_search import MODULUS_SIGMA, modulus_slope
 from rafl.capture.registration.initial import ResultantFit, fit_resultant, resultant_jacobian
 from rafl.capture.registration.rigid import RigidTransform
@@ -19,9 +19,9 @@ Array = NDArray[Any]
 MIN_PRIOR_SIGMA = 1e-8  # of a place that is exactly known [m]
 MAX_MODULUS_STEP = 0.3  # of log E in one iteration
 MAX_ITERATIONS = 10
-# The mesh follows the shape of a bent specimen to about this fraction of its deflection, and not closer than this
-# distance [m]. The error is alike in all recordings, so that more of them do not average it out.
-MODEL_FRACTION, MIN_MODEL_SIGMA = 0.01, 1e-5
+# The mesh follows no specimen closer than this distance [m], nor than MODEL_FRACTION of its deflection. The error is
+# alike in all recordings, so that more of them do not average it out.
+MIN_MODEL_SIGMA = 1e-5
 # The search ends with a smaller change of every place [m], of log E, and of the pose [rad, m].
 STEP_TOLERANCE, MODULUS_TOLERANCE, POSE_TOLERANCE = 1e-6, 1e-3, 1e-5
 
