@@ -116,7 +116,8 @@ class Registered:
             )
         surface = np.setdiff1d(np.unique(specimen.mesh.surface), specimen.fixed)
         nodes = surface if whole_surface else specimen.loaded
-        return FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface, axes=axes)
+        observation = FirstFrame(dataset.simulator, dataset.markers, nodes, target, sigma, name, whole_surface)
+        return replace(observation, moving=self.start.moving, axes=axes)
 
     def _views_without_lag(self) -> dict[str, View]:
         """What the cameras would have measured at the times of the frames: a specimen that moves has moved on since."""

@@ -11,9 +11,12 @@ from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-RESULTANT_SIGMA = 1.0  # of the amplitudes of the modes of a force and a moment on the nodes [N]
+RESULTANT_SIGMA = 1.0  # of a force on the nodes [N]; of a moment, with a lever as long as the specimen
 # Of the force of a known load, as a share of its weight: a string within three degrees of the vertical.
 LOAD_SIGMA = 0.05
+# Angle between gravity, as the specimen file has it, and the pull of a hanging weight [rad]: a hand levels a clamp, and
+# places a board, to about a degree.
+LEVEL_SIGMA = 0.02
 HANGING_SIGMA = 3e-3  # distance of the place where the load hangs from the middle of its nodes [m]
 # The mesh follows the shape of a bent specimen to about this fraction of its deflection.
 MODEL_FRACTION = 0.01
@@ -35,6 +38,7 @@ class FirstFrame:
         recording: name, for messages.
         whole_surface: whether `nodes` are the whole surface, each with an independent force.
         load: known load [kg] that hangs on `nodes`; 0 if the forces are unknown.
+        moving: whether the body is in motion, so that no load hangs on it at rest.
         axes: unit vectors along which every marker was measured, the rows of (M, 3, 3); x, y, z if None.
     """
 
@@ -46,6 +50,7 @@ class FirstFrame:
     recording: str
     whole_surface: bool = False
     load: float = 0.0
+    moving: bool = False
     axes: Array | None = None
 
     def along_axes(self, vectors: Array) -> Array:
@@ -69,10 +74,26 @@ class FirstFrame:
         """
         modes, size = rigid_modes(self.simulator.mesh.vertices[self.nodes])
         if self.load == 0.0:
-            return modes, np.full(modes.shape[1], RESULTANT_SIGMA)
+            lever = float(np.ptp(self.simulator.mesh.vertices, axis=0).max())
+            return modes, RESULTANT_SIGMA * np.concatenate([1.0 / size[:3], lever / size[3:]])
         weight = self.load * float(np.linalg.norm(self.simulator.gravity))
         force = np.full(3, weight * LOAD_SIGMA / np.sqrt(len(self.nodes)))
         return modes, np.concatenate([force, weight * HANGING_SIGMA / size[3:]])
+
+    def hanging_precision(self, weight: float) -> Array:
+        """Inverse prior covariance of the modes' amplitudes [1/N^2], for a weight that hangs on the nodes.
+
+        It pulls along gravity, and at a place near their middle. Its size is as unknown as that of any force.
+
+        weight: [N], about.
+        """
+        _, size = rigid_modes(self.simulator.mesh.vertices[self.nodes])
+        gravity = np.asarray(self.simulator.gravity)
+        down = gravity / np.linalg.norm(gravity)
+        along, sideways = np.outer(down, down), weight * LEVEL_SIGMA / size[0]
+        precision = np.diag(np.concatenate([np.zeros(3), (weight * HANGING_SIGMA / size[3:]) ** -2.0]))
+        precision[:3, :3] = along * (size[0] / RESULTANT_SIGMA) ** 2 + (np.eye(3) - along) / sideways**2
+        return precision
 
     @property
     def measured(self) -> NDArray[np.bool_]:

@@ -31,18 +31,23 @@ class ForcePrior:
             [N].
         shape_sigma: standard deviation of the loaded nodes from a rigid motion of them all [m]; infinite if they may
             deform.
+        hanging: whether the force is that of a weight, which pulls along gravity (`FirstFrame.hanging_precision`).
     """
 
     name: str
     local_sigma: float
     shape_sigma: float = np.inf
+    hanging: bool = False
 
-    def precision(self, frame: FirstFrame) -> Array:
-        """Inverse prior covariance of the forces on the frame's nodes [1/N^2], (3 L, 3 L)."""
+    def precision(self, frame: FirstFrame, weight: float = 0.0) -> Array:
+        """Inverse prior covariance of the forces on the frame's nodes [1/N^2], (3 L, 3 L).
+
+        weight: of what hangs on the nodes [N], about; needed if it hangs.
+        """
         modes, sigma = frame.resultant_modes()
-        resultant = (modes * sigma**-2.0) @ modes.T
-        precision: Array = resultant + (np.eye(len(modes)) - modes @ modes.T) / self.local_sigma**2
-        return precision
+        inverse = frame.hanging_precision(weight) if self.hanging else np.diag(sigma**-2.0)
+        local = (np.eye(len(modes)) - modes @ modes.T) / self.local_sigma**2
+        return np.asarray(modes @ inverse @ modes.T + local)
 
 
 @dataclass(frozen=True)
@@ -76,22 +81,26 @@ class ForceSearch:
     Args:
         frame: observation.
         prior: of the forces.
-        model_sigma: of the difference between mesh and specimen [m].
+        whitening: that turns the markers' residuals into independent numbers of variance one [1/m], (K, 3 M'). A depth
+            that no camera observed is an assumption, and the same one for all markers: it has no part in them.
         with_pose: whether the pose is fitted too.
         with_modulus: whether Young's modulus is fitted too, around the assumed one.
+        weight: of what hangs on the nodes [N], about, for the prior of a hanging weight.
     """
 
     def __init__(
-        self, frame: FirstFrame, prior: ForcePrior, model_sigma: float, with_pose: bool, with_modulus: bool
+        self,
+        frame: FirstFrame,
+        prior: ForcePrior,
+        whitening: Array,
+        with_pose: bool,
+        with_modulus: bool,
+        weight: float = 0.0,
     ) -> None:
         self.frame, self.prior, self.with_pose, self.with_modulus = frame, prior, with_pose, with_modulus
-        self.model_sigma = model_sigma
-        self.precision = prior.precision(frame)
+        self.whitening = whitening
+        self.precision = prior.precision(frame, weight)
         self.expected = frame.expected_force()
-        sigma, observed = frame.sigma[frame.measured], frame.observed_axes
-        self._measured_sigma = float(np.sqrt((sigma[observed] ** 2).mean()))
-        # A depth that no camera observed is an assumption, and the same one for all markers.
-        self.weight = np.where(observed, 1.0 / np.hypot(sigma, model_sigma), 0.0).ravel()
 
     def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float) -> Estimate:
         """Equilibrium, residual and objective, with the solve started at `start` (N, 3) if given."""
@@ -108,7 +117,7 @@ class ForceSearch:
         shape = self._shape(q)
         f = force[frame.nodes].ravel() - self.expected
         by_prior = f @ self.precision @ f + shape @ shape + (log_modulus / MODULUS_SIGMA) ** 2
-        objective = float(((self.weight * residual) ** 2).sum() + by_prior)
+        objective = float(((self.whitening @ residual) ** 2).sum() + by_prior)
         return Estimate(frame, log_modulus, force, pose, q, residual, shape, objective)
 
     def minimise(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float = 0.0) -> Estimate:
@@ -139,26 +148,31 @@ class ForceSearch:
             current = trial
         return current
 
-    def with_prior(self, prior: ForcePrior, model_sigma: float) -> "ForceSearch":
-        """The search for the same unknowns under another prior, with another error of the model [m]."""
-        return ForceSearch(self.frame, prior, model_sigma, self.with_pose, self.with_modulus)
-
     def rms(self, found: Estimate) -> float:
         """Root mean square of the residuals along observed axes [m]."""
         return float(np.sqrt((found.residual.reshape(-1, 3)[self.frame.observed_axes] ** 2).mean()))
 
-    @property
-    def observation_sigma(self) -> float:
-        """Root mean square standard deviation along observed axes, of measurement and model [m]."""
-        return float(np.hypot(self._measured_sigma, self.model_sigma))
+    def linearised(self, found: Estimate) -> tuple[Array, Array, Array]:
+        """The problem near an estimate, by the U unknowns less their expected values.
 
-    def model_error(self, found: Estimate) -> float:
-        """What the residuals exceed the measurement's standard deviation by, in squares [m]."""
-        return float(np.sqrt(max(self.rms(found) ** 2 - self._measured_sigma**2, 0.0)))
-
-    def residual_sigmas(self, found: Estimate) -> float:
-        """Root mean square residual over the measurement's standard deviation."""
-        return self.rms(found) / self._measured_sigma
+        Returns:
+            The markers' residuals where the unknowns are as expected, and their derivatives [m], (3 M', 1 + U); those
+            of `Estimate.shape`, (S, 1 + U); the inverse prior covariance of the unknowns, (U, U).
+        """
+        slopes, count = self._slopes(found), len(self.precision)
+        unknowns = slopes.shape[1]
+        precision, deviation = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+        precision[:count, :count] = self.precision
+        deviation[:count] = found.force[self.frame.nodes].ravel() - self.expected
+        if self.with_modulus:
+            precision[-1, -1], deviation[-1] = MODULUS_SIGMA**-2.0, found.log_modulus
+        by_shape = np.zeros((0, unknowns))
+        if np.isfinite(self.prior.shape_sigma):
+            by_shape = np.zeros((len(found.shape), unknowns))
+            by_shape[:, self._deforming(unknowns)] = self._shape_slopes(found)
+        shape = found.shape[: len(by_shape)]
+        rows = np.column_stack([found.residual - slopes @ deviation, slopes])
+        return rows, np.column_stack([shape - by_shape @ deviation, by_shape]), precision
 
     def log_evidence(self, found: Estimate) -> float:
         """Logarithm of the probability of the observation under the prior, up to a constant.
@@ -170,29 +184,14 @@ class ForceSearch:
         by_shape = self._shape_slopes(found) if np.isfinite(self.prior.shape_sigma) else np.zeros((0, len(hessian)))
         known = slice(0, len(self.precision))
         prior = self.precision + by_shape[:, known].T @ by_shape[:, known]
-        weight = self.weight[self.weight > 0.0]
         spread = np.linalg.slogdet(prior)[1] - np.linalg.slogdet(hessian)[1]
-        return float(np.log(weight).sum() + 0.5 * (spread - found.objective))
-
-    def marker_sigma(self, found: Estimate) -> Array:
-        """Largest standard deviations of the measured markers [m], (M'), in a fit without a pose.
-
-        By Laplace's approximation: the covariance of forces and log E is the inverse of the Gauss-Newton Hessian.
-        """
-        slopes = self._marker_slopes(found)
-        by_unknowns = slopes.reshape(-1, 3, slopes.shape[1])
-        solved = np.linalg.solve(self._normal_equations(found)[1], slopes.T).T.reshape(by_unknowns.shape)
-        sigma: Array = np.sqrt(np.linalg.eigvalsh(by_unknowns @ solved.swapaxes(1, 2))[:, -1])
-        return sigma
+        spread += np.linalg.slogdet(self.whitening @ self.whitening.T)[1]
+        return float(0.5 * (spread - found.objective))
 
     def _normal_equations(self, current: Estimate) -> tuple[Array, Array]:
         """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, the pose (6) or log E."""
-        jacobian = self._marker_slopes(current)
-        if self.with_pose:
-            posed = current.pose.apply(self.frame.target[self.frame.measured])
-            jacobian = np.concatenate([jacobian, -pose_jacobian(posed).reshape(-1, 6)], axis=1)
-        jacobian *= self.weight[:, None]
-        gradient, hessian = jacobian.T @ (self.weight * current.residual), jacobian.T @ jacobian
+        jacobian = self.whitening @ self._slopes(current)
+        gradient, hessian = jacobian.T @ (self.whitening @ current.residual), jacobian.T @ jacobian
         count = len(self.precision)
         gradient[:count] += self.precision @ (current.force[self.frame.nodes].ravel() - self.expected)
         hessian[:count, :count] += self.precision
@@ -201,10 +200,23 @@ class ForceSearch:
             hessian[-1, -1] += MODULUS_SIGMA**-2.0
         if np.isfinite(self.prior.shape_sigma):
             slopes = self._shape_slopes(current)
-            own = np.r_[:count, count + 6 * self.with_pose : len(gradient)]  # the pose does not deform the body
+            own = self._deforming(len(gradient))
             gradient[own] += slopes.T @ current.shape
             hessian[np.ix_(own, own)] += slopes.T @ slopes
         return gradient, hessian
+
+    def _deforming(self, unknowns: int) -> NDArray[np.int64]:
+        """Indices of the unknowns that deform the body: all but the pose."""
+        count = len(self.precision)
+        return np.asarray(np.r_[:count, count + 6 * self.with_pose : unknowns])
+
+    def _slopes(self, current: Estimate) -> Array:
+        """Derivatives of the residual by the unknowns: forces and, if fitted, the pose (6) or log E, (3 M', U)."""
+        slopes = self._marker_slopes(current)
+        if self.with_pose:
+            posed = current.pose.apply(self.frame.target[self.frame.measured])
+            slopes = np.concatenate([slopes, -pose_jacobian(posed).reshape(-1, 6)], axis=1)
+        return slopes
 
     def _marker_slopes(self, current: Estimate) -> Array:
         """Derivatives of the measured markers, along their axes, by forces and, if fitted, log E, (3 M', 3 L [+ 1])."""

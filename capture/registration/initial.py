@@ -6,26 +6,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
+from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.force_search import (
     Estimate,
     ForcePrior,
     ForceSearch,
     marker_jacobian,
 )
+from rafl.capture.registration.mesh_error import ASSUMED, EXACT, ErrorSizes, MeshError
 from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 
 Array = NDArray[Any]
 
-# A load hangs from the free end, and practically only its force and moment act; or a hand holds the end, so that it
-# hardly deforms (by 10 um, as little as a first frame tells), under any forces; or forces are local, and dent the mesh.
-HUNG, HELD = ForcePrior("hanging load", 1e-5), ForcePrior("held end", 10.0, shape_sigma=1e-5)
+# What may load the free end: a weight that hangs from it; any force and moment, and practically nothing else; a hand
+# that holds it, so that it hardly deforms (by 10 um, as little as a first frame tells); local forces, which dent it.
+WEIGHT = ForcePrior("hanging weight", 1e-5, hanging=True)
+PULL, HELD = ForcePrior("force and moment", 1e-5), ForcePrior("held end", 10.0, shape_sigma=1e-5)
 LOCAL = tuple(ForcePrior("local forces", sigma) for sigma in (5e-3, 5e-2, 0.5))
 SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act on the whole surface
-REFITS = 5  # at most, with the model's error that the last fit left
-SETTLED = 1.2  # ratio of standard deviations of the observation in successive fits; a smaller one ends the refits
-HANGING_ODDS = 3.0  # logarithm of how much likelier a hanging load is beforehand than forces of another kind
-EXPLAINED = 1.2  # root mean square residual over sigma of a fit that leaves nothing for other forces to explain
+LEAST_WEIGHT = 1e-3  # [N]
+REFITS = 5  # at most, with the error of the mesh that the last fit makes most probable
+SETTLED = 1.2  # ratio of standard deviations of the markers in successive fits; a smaller one ends the refits
 FORCE_CHANGE = LOCAL[0]  # prior of the forces whose change gives the velocity of a body in motion
 FORCE_CHANGE_RATE = 60.0  # 1/s: they change as in an oscillation of about 10 Hz
 
@@ -37,7 +38,8 @@ class InitialState:
     Attributes:
         q: node positions [m], (N, 3).
         force: virtual nodal forces, without gravity [N], (N, 3).
-        residual: root mean square marker distance over the observed axes [m].
+        residual: root mean square distance between the markers and those of the mesh in equilibrium, over the observed
+            axes [m].
         pose: from the frame of the target to the specimen frame; the identity if it was not fitted.
         marker_sigma: largest standard deviation of each marker's position in any direction [m], (M); NaN where the
             marker was not measured, and in fits with a pose.
@@ -55,13 +57,13 @@ class InitialState:
 def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> InitialState:
     """Fit virtual forces such that the markers of the equilibrium match the first frame.
 
-    Levenberg-Marquardt minimises sum |x(q(f)) - target|^2 / (sigma^2 + s^2) + (f - f0) . C^-1 (f - f0), where f0 and C
-    are mean and covariance of the forces' prior. The implicit function theorem gives the Jacobian through the
-    equilibrium, dx/df = dx/dq K^-1.
+    Levenberg-Marquardt minimises (x(q(f)) - target) . R^-1 (x(q(f)) - target) + (f - f0) . C^-1 (f - f0), where R is
+    the covariance of measurement and mesh, and f0 and C are mean and covariance of the forces' prior. The implicit
+    function theorem gives the Jacobian through the equilibrium, dx/df = dx/dq K^-1.
 
-    The mesh only approximates the specimen, by s, which is what a fit leaves beyond sigma. If forces act on the free
-    end, several priors are tried, and the one is kept under which the observation is most probable. Forces that dent
-    the mesh so pay for themselves only where they explain more than an error of the mesh does.
+    The mesh only approximates the specimen (`MeshError`); the sizes of its error are those that the fit makes most
+    probable. If forces act on the free end, several priors are tried, and the one is kept under which the observation
+    is most probable. Forces that dent the mesh are tried only where the mesh's error would be larger than is assumed.
 
     Args:
         frame: observation.
@@ -70,64 +72,94 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     Raises:
         SimulationError: an equilibrium could not be found.
     """
-    with_pose, zero = pose is not None, np.zeros_like(frame.simulator.mesh.vertices)
-    marker_sigma = np.full(len(frame.target), np.nan)
-    if frame.whole_surface:
-        search = ForceSearch(frame, SURFACE_PRIOR, 0.0, with_pose, False)
-        best = search.minimise(zero, pose or IDENTITY, None)
-    else:
-        # The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose
-        # would: the two can hardly be told apart.
-        with_modulus = not with_pose
-        first = ForceSearch(frame, HUNG, _assumed_error(frame, pose), with_pose, with_modulus)
-        search, best = _choose(first, first.minimise(zero, pose or IDENTITY, None))
-        if with_modulus:
-            marker_sigma[frame.measured] = search.marker_sigma(best)
-    weight = frame.simulator.weight
-    # With the assumed modulus, the same shape needs forces that are larger by the ratio of the moduli.
-    force = np.exp(-best.log_modulus) * (weight + best.force) - weight
-    return InitialState(best.q, force, np.sqrt(3.0) * search.rms(best), best.pose, marker_sigma, search.prior.name)
+    start, marker_sigma = pose or IDENTITY, np.full(len(frame.target), np.nan)
+    error = MeshError.of(frame, start.apply(frame.target[frame.measured]))
+    fit = _fit_surface(frame, error, pose) if frame.whole_surface else _fit_tip(frame, error, pose)
+    q = fit.found.q + error.correction(fit.sizes, fit.found.residual)
+    if not frame.whole_surface and pose is None:
+        marker_sigma[frame.measured] = fit.marker_sigma(error)
+    # The same shape of a body with the assumed modulus.
+    force = frame.simulator.elastic_gradient(q[None])[0] - frame.simulator.weight
+    force[frame.simulator.fixed] = 0.0
+    residual = np.sqrt(3.0) * fit.search.rms(fit.found)
+    return InitialState(q, force, residual, fit.found.pose, marker_sigma, fit.search.prior.name)
 
 
-def _assumed_error(frame: FirstFrame, pose: RigidTransform | None) -> float:
-    """The error of the mesh from which the search starts [m], by the deflection that was measured.
+@dataclass(frozen=True)
+class _Fit:
+    """A fit of the first frame.
 
-    Without it, a mesh that cannot match the markers would be bent by forces and a modulus out of all proportion.
+    Attributes:
+        search: that found it.
+        found: the loaded body.
+        sizes: of the mesh's error.
+        evidence: logarithm of how probable the prior, the sizes and the observation are together, up to a constant.
     """
-    target = frame.target[frame.measured] if pose is None else pose.apply(frame.target[frame.measured])
-    moved = frame.along_axes(target - frame.markers.rest[frame.measured])[frame.observed_axes]
-    return MODEL_FRACTION * float(np.sqrt((moved**2).mean()))
+
+    search: ForceSearch
+    found: Estimate
+    sizes: ErrorSizes
+    evidence: float
+
+    def marker_sigma(self, error: MeshError) -> Array:
+        """Largest standard deviations of the measured markers in any direction [m], (M'), by linearisation."""
+        rows, known, precision = self.search.linearised(self.found)
+        covariance = np.linalg.inv(precision + known[:, 1:].T @ known[:, 1:])
+        return error.marker_sigma(self.sizes, rows[:, 1:], covariance)
 
 
-def _choose(first: ForceSearch, found: Estimate) -> tuple[ForceSearch, Estimate]:
-    """The most probable fit; forces that dent the mesh are tried only if no others explain the observation.
+def _fit_surface(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -> _Fit:
+    """The fit of forces on the whole surface, which leave no error of the mesh."""
+    search = ForceSearch(frame, SURFACE_PRIOR, error.whitening(EXACT), pose is not None, False)
+    found = search.minimise(np.zeros_like(frame.simulator.mesh.vertices), pose or IDENTITY, None)
+    return _Fit(search, found, EXACT, 0.0)
 
-    first, found: the fit to a hanging load, of a mesh with the error that is assumed.
+
+def _fit_tip(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -> _Fit:
+    """The most probable fit of forces on the free end.
+
+    The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose would:
+    the two can hardly be told apart.
     """
-    fits = [_refit(first, HUNG, found), _refit(first, HELD, found)]
-    search, best = _most_probable(fits)
-    if search.residual_sigmas(best) < EXPLAINED:
-        return search, best
-    return _most_probable([*fits, *(_refit(first, prior, found) for prior in LOCAL)])
+    first = ForceSearch(frame, PULL, error.whitening(ASSUMED), pose is not None, pose is None)
+    return _choose(first, first.minimise(np.zeros_like(frame.simulator.mesh.vertices), pose or IDENTITY, None), error)
 
 
-def _most_probable(fits: list[tuple[ForceSearch, Estimate]]) -> tuple[ForceSearch, Estimate]:
-    odds = [HANGING_ODDS if search.prior is HUNG else 0.0 for search, _ in fits]
-    evidence = [search.log_evidence(found) + odd for (search, found), odd in zip(fits, odds, strict=True)]
-    return fits[int(np.argmax(evidence))]
+def _choose(first: ForceSearch, found: Estimate, error: MeshError) -> _Fit:
+    """The most probable fit.
+
+    first, found: the fit of any force and moment, of a mesh with the error that is assumed.
+    """
+    weighed = [WEIGHT] if np.any(first.frame.simulator.gravity) and not first.frame.moving else []
+    fits = [_refit(first, prior, found, error) for prior in (*weighed, PULL, HELD)]
+    best = max(fits, key=lambda fit: fit.evidence)
+    if (best.sizes.values <= ASSUMED.values).all():
+        return best
+    fits += [_refit(first, prior, found, error) for prior in LOCAL]
+    return max(fits, key=lambda fit: fit.evidence)
 
 
-def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate) -> tuple[ForceSearch, Estimate]:
-    """The fit under a prior, with the model's error that this fit leaves, from that to a hanging load."""
-    last = np.inf
+def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate, error: MeshError) -> _Fit:
+    """The fit under a prior, with the most probable error of the mesh, from that of any force and moment."""
+    sizes, last = ASSUMED, np.inf
     for _ in range(REFITS):
-        search = first.with_prior(prior, first.model_error(found))
+        search = _search(first, prior, error.whitening(sizes), found)
         found = search.minimise(found.force, found.pose, found.q, found.log_modulus)
-        sigma = search.observation_sigma
-        if last < SETTLED * sigma:
+        sigma = error.total_sigma(sizes)
+        if 1.0 / SETTLED < sigma / last < SETTLED:
             break
-        last = sigma
-    return search, found
+        last, fitted = sigma, sizes
+        sizes = error.most_probable(*search.linearised(found), sizes)
+    evidence = search.log_evidence(found) + error.log_probability(fitted)
+    return _Fit(search, found, fitted, evidence)
+
+
+def _search(first: ForceSearch, prior: ForcePrior, whitening: Array, found: Estimate) -> ForceSearch:
+    """The search for the same unknowns under another prior; a weight that hangs is about the one found."""
+    weight, gravity = 0.0, np.asarray(first.frame.simulator.gravity)
+    if prior.hanging:
+        weight = max(abs(float(found.force.sum(axis=0) @ gravity)) / float(np.linalg.norm(gravity)), LEAST_WEIGHT)
+    return ForceSearch(first.frame, prior, whitening, first.with_pose, first.with_modulus, weight)
 
 
 @dataclass(frozen=True)
@@ -138,13 +170,13 @@ class ResultantFit:
         force: virtual nodal forces [N], (N, 3).
         q: node positions [m], (N, 3).
         residual: markers of the mesh minus measured markers along their axes [m], (3 M').
-        weight: of the residuals in the objective [1/m], (3 M').
+        whitening: of the residuals in the objective [1/m], (K, 3 M').
     """
 
     force: Array
     q: Array
     residual: Array
-    weight: Array
+    whitening: Array
 
 
 def fit_resultant(frame: FirstFrame, model_sigma: float, start: ResultantFit | None = None) -> ResultantFit:
@@ -155,13 +187,15 @@ def fit_resultant(frame: FirstFrame, model_sigma: float, start: ResultantFit | N
     Raises:
         SimulationError: an equilibrium could not be found.
     """
-    search = ForceSearch(frame, HUNG, model_sigma, False, False)
+    sigma = np.hypot(frame.sigma[frame.measured], model_sigma)
+    weight = np.where(frame.observed_axes, 1.0 / sigma, 0.0).ravel()
+    search = ForceSearch(frame, PULL, np.diag(weight), False, False)
     force = np.zeros_like(frame.simulator.mesh.vertices)
     force[frame.nodes] = frame.expected_force().reshape(-1, 3)
     if start is not None:
         force = start.force
     found = search.minimise(force, IDENTITY, start.q if start else None)
-    return ResultantFit(found.force, found.q, found.residual, search.weight)
+    return ResultantFit(found.force, found.q, found.residual, search.whitening)
 
 
 def resultant_jacobian(frame: FirstFrame, fit: ResultantFit) -> tuple[Array, Array]:
@@ -173,8 +207,9 @@ def resultant_jacobian(frame: FirstFrame, fit: ResultantFit) -> tuple[Array, Arr
     modes, sigma = frame.resultant_modes()
     prior = 1.0 / sigma
     amplitude = modes.T @ (fit.force[frame.nodes].ravel() - frame.expected_force())
-    jacobian = fit.weight[:, None] * (marker_jacobian(frame, fit.q) @ modes)
-    return np.concatenate([jacobian, np.diag(prior)]), np.concatenate([fit.weight * fit.residual, prior * amplitude])
+    jacobian = fit.whitening @ marker_jacobian(frame, fit.q) @ modes
+    residual = np.concatenate([fit.whitening @ fit.residual, prior * amplitude])
+    return np.concatenate([jacobian, np.diag(prior)]), residual
 
 
 def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> Array:

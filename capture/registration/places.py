@@ -132,7 +132,7 @@ def _reduced_normal_equations(frame: FirstFrame, fit: ResultantFit, posed: bool)
     whole[rows, 0] = modulus_slope(frame, fit.q, fit.force).ravel()
     shared = np.zeros((len(residual), whole.shape[1]))
     by_axis = frame.along_axes(whole[rows].reshape(-1, 3, whole.shape[1])).reshape(len(rows), -1)
-    shared[: len(rows)] = fit.weight[:, None] * by_axis
+    shared[: len(fit.whitening)] = fit.whitening @ by_axis
     # What the forces can explain is taken out.
     basis = np.linalg.qr(local)[0]
     shared -= basis @ (basis.T @ shared)
