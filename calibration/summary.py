@@ -11,6 +11,11 @@ from rafl.calibration.validation import CheckedView
 from rafl.common.command_line import create_table
 
 MAX_SILENT_BIAS_M = 20e-6  # a larger marker error from a lens's perspective gives a warning
+# Where markers are not where the specimen has them, and the board's pose may be right: the cause, and how to check it.
+OTHER_SET_UP = (
+    "the calibration belongs to another set-up, or a camera was moved after it (to check, open rafl-review calib.yaml: "
+    "the pixel where the axes start must show the specimen's lower corner at the clamp in the films too)"
+)
 
 
 def camera_table(solution: Solution, views: dict[str, list[View]]) -> Table:

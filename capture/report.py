@@ -4,8 +4,8 @@ import jinja2
 import matplotlib.pyplot as plt
 import numpy as np
 
-from rafl.capture.dataset.camera_summary import camera_rows
-from rafl.capture.dataset.summary import largest_sigma, warnings
+from rafl.capture.dataset.camera_summary import CAMERA_HEADINGS, camera_rows
+from rafl.capture.dataset.summary import VALID, largest_sigma, warnings
 from rafl.capture.specimen.specimen import Specimen
 from rafl.data.dataset import Dataset
 from rafl.data.markers import Markers
@@ -19,7 +19,8 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}
  body{font:16px/1.5 system-ui,sans-serif;max-width:66rem;margin:2rem auto;padding:0 1rem;color:#222}
  table{border-collapse:collapse;margin:1rem 0;display:block;overflow-x:auto}
  th,td{padding:.25rem .4rem;text-align:right;border-bottom:1px solid #ddd}
- td:first-child,th:first-child{text-align:left}
+ td:first-child,th:first-child{text-align:left;overflow-wrap:anywhere;min-width:5rem}
+ .matrix th{overflow-wrap:anywhere;min-width:3.5rem} .lines td{white-space:nowrap} .lines{font-size:.9em}
  img{max-width:100%} .note{color:#666} .worse{color:#c0392b}
 </style>
 <h1>Dataset {{ name }}</h1>
@@ -28,22 +29,29 @@ PAGE = """<!doctype html><html lang="en"><meta charset="utf-8"><title>{{ name }}
 <p>{{ mesh }}</p>
 <img alt="mesh with markers" src="data:image/png;base64,{{ mesh_image }}">
 <h2>Recordings</h2>
-<p class="note">Registration: largest distance of a marker from its layout position after the transform to the specimen
-frame. First frame fit: root mean square distance between the markers of the fitted mesh and the recorded ones. Sigma:
-largest standard deviation of a marker of the fitted mesh in any direction; across the line of sight of one camera it is
-small, along it only the specimen's shape tells the position. Loaded by: what the shape of the first frame shows.</p>
+<p class="note">Valid: {{ valid }}. First frame: its number in the film, and what told it. State: whether the specimen
+rests in it or moves; of a rest, the frames averaged.</p>
 <table><tr><th>recording</th><th>split</th><th>load [g]</th><th>frames</th><th>valid</th><th>first frame</th>
-<th>found from</th><th>state</th><th>loaded by</th><th>frames averaged</th><th>registered by</th>
-<th>registration [mm]</th><th>first frame fit [mm]</th><th>sigma [mm]</th></tr>
+<th>found from</th><th>state</th><th>averaged</th></tr>
 {% for row in rows %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
+<p class="note">Registration: largest distance of a marker from its layout position after the transform to the specimen
+frame. Fit: root mean square distance between the markers of the mesh fitted to the first frame and the recorded ones.
+Sigma: largest standard deviation of a marker of the fitted mesh in any direction; across the line of sight of one
+camera it is small, along it only the specimen's shape tells the position. Loaded by: what the shape of the first frame
+shows.</p>
+<table><tr><th>recording</th><th>registered by</th><th>registration [mm]</th><th>loaded by</th><th>fit [mm]</th>
+<th>sigma [mm]</th></tr>
+{% for row in fits %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 {% if cameras %}<h2>Cameras</h2>
 <p class="note">How each camera was found to have moved since its calibration, and how late its clock is: turned about
-the middle of the markers and shifted, along x, y and z of the specimen; what to add to its
-<code>time_offset_s</code>; and how far the pixels of the markers are from where the calibration has them.</p>
-<table><tr><th>camera</th><th>turned [degrees]</th><th>shifted [mm]</th><th>clock [frames]</th><th>pixels [px]</th></tr>
-{% for row in cameras %}<tr><td>{{ row.camera }}</td><td>{{ row.turn }}</td><td>{{ row.shift }}</td>
-<td>{{ row.clock }}</td>
-<td{% if row.touched %} class="worse"{% endif %}>{{ row.pixels }}</td></tr>{% endfor %}</table>{% endif %}
+the middle of the markers and shifted, along x, y and z of the specimen, one a line; what to add to its
+<code>time_offset_s</code> in calib.yaml, in seconds, and the same in frames; how far the pixels of the markers are from
+where the calibration has them; and what no turn, shift or clock explains of the difference between the simulated and
+the recorded pixels, beside the standard deviation of these.</p>
+<table class="lines"><tr>{% for heading in camera_headings %}<th>{{ heading }}</th>{% endfor %}</tr>
+{% for row in cameras %}<tr{% if row.touched or not row.explained %} class="worse"{% endif %}>
+{% for lines in row.cells %}<td>{% for line in lines %}{{ line }}<br>{% endfor %}</td>{% endfor %}</tr>{% endfor %}
+</table>{% endif %}
 <h2>Young's modulus</h2>
 <p class="note">Each recording shows it twice: by the bend under the load that was released, and by the frequency of the
 swing. The two depend on different quantities: the load, or the frame rate and the density. Both take Poisson's ratio
@@ -58,7 +66,7 @@ that depends on Poisson's ratio and on the size of the elements, so the values h
 {% if not_shown %}{{ not_shown }} more recordings are not shown.{% endif %}</p>
 {% for image in first_frames %}<img alt="first frames" src="data:image/png;base64,{{ image }}">{% endfor %}
 <h2>First-frame residuals of the markers [mm]</h2>
-<table><tr><th>marker</th>{% for name in names %}<th>{{ name }}</th>{% endfor %}</tr>
+<table class="matrix"><tr><th>marker</th>{% for name in names %}<th>{{ name }}</th>{% endfor %}</tr>
 {% for row in residuals %}<tr>{% for cell in row %}<td>{{ cell }}</td>{% endfor %}</tr>{% endfor %}</table>
 {% if places %}<h2>Places of the markers</h2>
 <p class="note">How far each marker was found from its <code>at_mm</code> on the undeformed body, by the first frames of
@@ -88,7 +96,10 @@ def dataset_page(specimen: Specimen, dataset: Dataset) -> str:
             mesh=f"{len(mesh.vertices)} vertices, {len(mesh.hexes)} elements, {len(dataset.simulator.fixed)} fixed "
             f"vertices. The elements have {filled:.1%} of the volume of the shape.",
             mesh_image=draw_specimens(mesh, [("at rest", mesh.vertices, dataset.markers.rest)]),
+            valid=VALID,
+            camera_headings=CAMERA_HEADINGS,
             rows=[_row(name, dataset) for name in items],
+            fits=[_fit(name, item.attributes) for name, item in items.items()],
             first_frames=[
                 draw_specimens(mesh, shown[k : k + FRAMES_PER_ROW]) for k in range(0, len(shown), FRAMES_PER_ROW)
             ],
@@ -119,10 +130,17 @@ def _row(name: str, dataset: Dataset) -> list[object]:
         values["first_frame"],
         values["first_frame_from"],
         "moving" if values["initial"] == "moving" else "at rest",
-        values.get("loading", "-"),
         values["still_frames"],
+    ]
+
+
+def _fit(name: str, values: dict[str, object]) -> list[object]:
+    """Row of the table of registrations and first frames."""
+    return [
+        name,
         values["registration"],
         _measured(float(str(values["registration_residual_mm"])), ".3f"),
+        values.get("loading", "-"),
         f"{values['fit_residual_mm']:.3f}",
         _measured(largest_sigma(values), ".2g"),
     ]

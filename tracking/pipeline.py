@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from rafl.calibration.camera import OrthographicCamera
 from rafl.calibration.rig import Rig, rig_text
-from rafl.calibration.summary import MAX_SILENT_BIAS_M
+from rafl.calibration.summary import MAX_SILENT_BIAS_M, OTHER_SET_UP
 from rafl.common.errors import InputError
 from rafl.common.files import sha256
 from rafl.common.version import VERSION
 from rafl.tracking.linking.follow import MIN_MARKERS, PixelTracks, follow
 from rafl.tracking.linking.layout import MarkerLayout
-from rafl.tracking.linking.naming import name_by_layout, name_by_rows
+from rafl.tracking.linking.naming import averted_markers, name_by_layout, name_by_rows
 from rafl.tracking.reconstruction.gap_filling import MEASURED, fill_gaps
 from rafl.tracking.reconstruction.tracks import Tracks, read_tracks
 from rafl.tracking.reconstruction.triangulation import (
@@ -30,8 +30,10 @@ from rafl.tracking.reconstruction.triangulation import (
 from rafl.tracking.video.reader import Video
 from rafl.tracking.video.timestamps import (
     camera_times,
+    clock_text,
     common_clock,
     estimate_clock_delays,
+    frame_rate,
     late_starts,
     slow_motion_note,
 )
@@ -41,6 +43,7 @@ Array = NDArray[Any]
 # Share of the markers that a load or the weight hardly displaces, those near the clamp, and how far they may be from
 # their places [m]: as far as `rafl-capture` allows.
 NEAREST_SHARE, MAX_OFF_PLACE = 0.2, 3e-3
+NAMES_SHOWN = 4  # of the markers on a face that no camera films
 
 
 @dataclass(frozen=True)
@@ -117,7 +120,10 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         notes += [note for camera, item in followed.items() for note in slow_motion_note(videos[camera], item.time)]
     if settings.sync and len(in_order) > 1:
         offsets = estimate_clock_delays(rig, in_order, times)
-        notes += [f"camera {camera}: clock offset {1e3 * s:+.3f} ms, from the motion" for camera, s in offsets.items()]
+        notes += [
+            f"camera {camera}: clock offset {clock_text(offset, frame_rate(times[camera]))}, from the motion"
+            for camera, offset in offsets.items()
+        ]
     elif len(in_order) > 1:
         offsets, remarks = late_starts(rig, in_order, times)
         notes += remarks
@@ -137,9 +143,10 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
         )
     if settings.layout is not None:
         seen = {name for name, known in zip(order, (state == MEASURED).any(axis=0), strict=True) if known}
-        notes += _frame_note(settings.layout, order, position)
-        if lost := [name for name in settings.layout.names if name not in seen]:
-            notes.append(f"markers {', '.join(lost)} of the specimen were never found")
+        other_frame = _frame_note(settings.layout, order, position)
+        notes += other_frame
+        averted = {} if other_frame else averted_markers(settings.layout, [rig.cameras[camera] for camera in followed])
+        notes += _lost_notes([name for name in settings.layout.names if name not in seen], averted)
     for camera, item in followed.items():
         for frames, what in (
             (item.damaged, "are damaged"),
@@ -177,10 +184,10 @@ def track_recording(videos: dict[str, Video], rig: Rig, settings: TrackingSettin
 def _late_note(camera: str, time: Array, clock: Array, frame: NDArray[np.int64]) -> str:
     """A note on a camera that films at other times [s] than the rows, of which each shows a frame, or none (-1)."""
     shown = frame >= 0
-    late = 1e3 * float(np.median(time[frame[shown]] - clock[shown]))
+    late = clock_text(float(np.median(time[frame[shown]] - clock[shown])), frame_rate(clock))
     return (
-        f"camera {camera}: films {late:+.3f} ms from the times of the tracks; its dots are interpolated there, and "
-        "kept as filmed too"
+        f"camera {camera}: films {late} from the times of the tracks; its dots are interpolated there, and kept as "
+        "filmed too"
     )
 
 
@@ -220,10 +227,24 @@ def _frame_note(layout: MarkerLayout, names: list[str], position: Array) -> list
         return []
     return [
         f"even the markers nearest to their places in the specimen file are {x:.1f}, {y:.1f}, {z:.1f} mm off along x, "
-        "y, z: the calibration's world is not the specimen's frame. Check which corner of the board has the position "
-        "in board.yaml (ChArUco: the corner of the print; chessboard: the outermost inner corner), or give "
-        "rafl-capture a recording at rest (--rest)"
+        f"y, z: the calibration's world is not the specimen's frame, or {OTHER_SET_UP}. Check also which corner of the "
+        "board has the position in board.yaml (ChArUco: the corner of the print; chessboard: the outermost inner "
+        "corner), or give rafl-capture a recording at rest (--rest)"
     ]
+
+
+def _lost_notes(lost: list[str], averted: dict[str, list[str]]) -> list[str]:
+    """Notes on markers that were never found: those on faces that look away from all cameras, and the others."""
+    notes = []
+    for face, names in averted.items():
+        if hidden := [name for name in names if name in lost]:
+            lost = [name for name in lost if name not in hidden]
+            count = f"{len(hidden)} marker{'s' if len(hidden) > 1 else ''}"
+            listed = ", ".join(hidden[:NAMES_SHOWN]) + (", ..." if len(hidden) > NAMES_SHOWN else "")
+            notes.append(f"{count} on the face {face} ({listed}): not in view of any camera")
+    if lost:
+        notes.append(f"markers {', '.join(lost)} of the specimen were never found")
+    return notes
 
 
 def _arrange_columns(item: PixelTracks, names: list[str | None], order: list[str]) -> CameraPixels:

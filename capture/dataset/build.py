@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from rafl.calibration.summary import OTHER_SET_UP
 from rafl.capture.dataset.camera_summary import change_attributes
 from rafl.capture.dataset.modulus import estimate_modulus
 from rafl.capture.dataset.naming import in_layout_order
@@ -244,8 +245,8 @@ def _fit_initial_state(
         raise InputError(
             f"recording {frame.recording}: expected a first frame that a deformation of the specimen explains, found "
             f"its markers {1e3 * initial.residual:.2f} mm off (root mean square; at most "
-            f"{1e3 * settings.fit_tolerance:g} mm); check that the calibration's world is the specimen's frame, or "
-            "allow it with --fit-tolerance-mm"
+            f"{1e3 * settings.fit_tolerance:g} mm). Either the calibration's world is not the specimen's frame, or "
+            f"{OTHER_SET_UP}; --fit-tolerance-mm allows more"
         )
     return initial
 

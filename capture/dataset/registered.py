@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.calibration.summary import OTHER_SET_UP
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.table import RecordingRow
 from rafl.capture.registration.averaging import average_frames, average_views
@@ -204,8 +205,9 @@ def _check_places(specimen: Specimen, described: Markers, markers: Markers, sett
     if distance > settings.fit_tolerance:
         raise InputError(
             f"specimen {specimen.name}: expected the markers near their at_mm, found them {1e3 * distance:.2f} mm off "
-            f"in the first frames (root mean square; at most {1e3 * settings.fit_tolerance:g} mm); check at_mm, that "
-            "the calibration's world is the specimen's frame, or allow it with --fit-tolerance-mm"
+            f"in the first frames (root mean square; at most {1e3 * settings.fit_tolerance:g} mm). Either at_mm is "
+            f"wrong, or the calibration's world is not the specimen's frame, or {OTHER_SET_UP}; --fit-tolerance-mm "
+            "allows more"
         )
 
 

@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from rafl.capture.dataset.camera_summary import camera_rows, camera_warnings
+from rafl.calibration.summary import OTHER_SET_UP
+from rafl.capture.dataset.camera_summary import CAMERA_HEADINGS, camera_rows, camera_warnings
 from rafl.capture.dataset.contradictions import contradictions
 from rafl.common.command_line import create_table
 from rafl.data.dataset import Dataset
@@ -17,7 +18,12 @@ from rafl.data.dataset_file import read_dataset
 from rafl.fem.material import modulus_hint
 
 MISPLACED_MM = 2.0  # farther from its description than a hand misplaces a dot: four usual standard deviations
-
+MANY_MISPLACED = 3  # so many may have one cause, the calibration
+# What the share of valid positions counts.
+VALID = (
+    "share of positions that are known, of all markers in the specimen file in all frames. A marker on a face that no "
+    "camera films has none: of two faces with as many dots, one alone gives 50 %"
+)
 TOLD_APART = 0.1  # standard deviation of log E up to which a frame is told apart from the material
 
 
@@ -25,6 +31,7 @@ def recordings_table(dataset: Dataset) -> Table:
     """Table with one row per recording: split, load, first frame, residuals of registration and first frame, sigma."""
     fits = ("registration [mm]", "first frame fit [mm]", "sigma [mm]")
     table = create_table("recording", "split", "load [g]", "frames", "valid", "first frame", *fits)
+    table.caption, table.caption_justify = Text(f"valid: {VALID}", style="default"), "left"
     for name, item in dataset.trajectories.items():
         values = item.attributes
         averaged = int(str(values.get("still_frames", 0)))
@@ -49,9 +56,9 @@ def recordings_table(dataset: Dataset) -> Table:
 def cameras_table(dataset: Dataset) -> Table | None:
     """Table of the cameras that were found elsewhere than calibrated; None without any."""
     rows = camera_rows(dataset)
-    table = create_table("camera", "turned [degrees]", "shifted [mm]", "clock [frames]", "pixels [px]")
+    table = create_table(*CAMERA_HEADINGS)
     for row in rows:
-        table.add_row(row.camera, row.turn, row.shift, row.clock, row.pixels)
+        table.add_row(*("\n".join(lines) for lines in row.cells))
     return table if rows else None
 
 
@@ -73,12 +80,19 @@ def warnings(dataset: Dataset) -> list[str]:
         lines.append(f"specimen {dataset.name}: {hint}")
     moved = dataset.markers.moved
     distances = np.zeros(len(dataset.markers.names)) if moved is None else 1e3 * np.linalg.norm(moved, axis=1)
-    for name, distance in zip(dataset.markers.names, distances, strict=True):
-        if distance > MISPLACED_MM:
-            lines.append(
-                f"marker {name}: found {distance:.1f} mm from its at_mm in the first frames; correct at_mm, or its "
-                "name in the tracks"
-            )
+    off = [(name, mm) for name, mm in zip(dataset.markers.names, distances, strict=True) if mm > MISPLACED_MM]
+    if len(off) < MANY_MISPLACED:
+        lines += [
+            f"marker {name}: found {mm:.1f} mm from its at_mm in the first frames; correct at_mm, or its name in the "
+            "tracks"
+            for name, mm in off
+        ]
+    else:
+        listed = ", ".join(f"{name} {mm:.1f}" for name, mm in off)
+        lines.append(
+            f"markers found far from their at_mm in the first frames, in mm: {listed}. Correct at_mm, or their names "
+            f"in the tracks; or else {OTHER_SET_UP}"
+        )
     if names := dataset.registered_through_model:
         found = [dataset.trajectories[name].attributes for name in names]
         lines.append(f"recordings {', '.join(names)}: {_frame_through_model(found)}")

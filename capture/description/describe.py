@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from rafl.calibration.summary import OTHER_SET_UP
 from rafl.capture.description.alignment import HARDLY_TOLD, Alignment, align_with_surface, find_pose
 from rafl.capture.description.naming import dots_by_row, faces_of, name_dots
 from rafl.capture.description.still import Dots, dots_at_rest
@@ -207,7 +208,7 @@ def _reason(shape: Shape, q: Array, dots: Dots) -> str:
             f"moved by about {x:.0f}, {y:.0f}, {z:.0f} mm along x, y, z and turned by {turn:.0f} degrees they would "
             "lie on it, so the world of the recording is not the specimen's frame (origin at the lower corner of the "
             "clamped face on the side of smallest y, x from clamp to tip, z up): calibrate with the board at that "
-            "corner, or set the origin of motion capture there; or the size of the body is wrong"
+            f"corner, or set the origin of motion capture there; or the size of the body is wrong, or {OTHER_SET_UP}"
         )
     spans = [" x ".join(f"{1e3 * x:.1f}" for x in np.ptp(p, axis=0)) for p in (dots.position, shape.mesh.vertices)]
     return (

@@ -58,8 +58,24 @@ def test_a_world_that_is_not_the_specimens_frame_is_noted(tmp_path: Path, off_mm
         assert note.startswith(
             "even the markers nearest to their places in the specimen file are 10.7, 0.0, 0.0 mm off"
         )
+        assert "the calibration belongs to another set-up, or a camera was moved after it" in note
+        assert "rafl-review calib.yaml" in note
     else:
         assert note == ""
+
+
+def test_markers_on_a_face_that_no_camera_films_are_counted(tmp_path: Path) -> None:
+    """The camera looks along z at the face z-min of a box. Behind it are 12 more dots, and one dot is not there."""
+    moving_dots(tmp_path / "a.mkv", list(range(8)))
+    front = [(4.0 + 3 * i, 4.0 + 3.5 * j, 0.0) for i in range(4) for j in range(3)]
+    behind = [(x, y, 6.0) for x, y, _ in front]
+    places = 1e-3 * np.array([*front, (11.5, 13.5, 0.0), *behind])
+    names = (*(f"F{k}" for k in range(12)), "absent", *(f"B{k}" for k in range(12)))
+    note = notes_of(tmp_path / "a.mkv", CAMERA, MarkerLayout(names, places, 5e-4, (0.02, 0.016, 0.006)))
+    assert note == (
+        "12 markers on the face z-max (B0, B1, B2, B3, ...): not in view of any camera; "
+        "markers absent of the specimen were never found"
+    )
 
 
 def test_frames_shown_again_are_noted(tmp_path: Path) -> None:

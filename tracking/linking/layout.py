@@ -1,7 +1,7 @@
 """The marker layout: names and positions of the markers on the undeformed specimen."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -76,12 +76,21 @@ _Item = Annotated[Annotated[MarkerEntry, Tag("<marker>")] | Annotated[MarkerGrid
 MarkerList = Annotated[list[_Item], AfterValidator(_check_unique_names)]
 
 
+class _Body(BaseModel):
+    """The size of a box; other shapes are ignored."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+    box_mm: tuple[float, float, float] | None = None
+
+
 class MarkerEntries(BaseModel):
     """The part of a specimen file that tracking reads. Other keys are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
     format: str
+    geometry: _Body | None = None
     markers: Annotated[MarkerList, Field(min_length=1)]
 
 
@@ -93,11 +102,13 @@ class MarkerLayout:
         names: (M).
         positions: at rest, in the specimen frame, as described [m], (M, 3).
         sigma: standard deviations of the positions [m], (M), or one for all.
+        box: size of the specimen [m], (3), if it is a box with a corner in the origin; None if that is not known.
     """
 
     names: tuple[str, ...]
     positions: NDArray[np.float64]
     sigma: NDArray[np.float64] | float = 1e-3 * DEFAULT_SIGMA_MM
+    box: tuple[float, float, float] | None = None
 
     @classmethod
     def of(cls, items: Sequence[MarkerEntry | MarkerGrid]) -> "MarkerLayout":
@@ -115,4 +126,8 @@ def read_layout(path: Path) -> MarkerLayout:
         InputError: the file is missing, damaged, or of a newer version.
     """
     content = read_yaml(path, MarkerEntries, "a specimen (specimen.yaml)", SPECIMEN_FORMAT)
-    return MarkerLayout.of(content.markers)
+    layout = MarkerLayout.of(content.markers)
+    if content.geometry is None or content.geometry.box_mm is None:
+        return layout
+    x, y, z = content.geometry.box_mm
+    return replace(layout, box=(1e-3 * x, 1e-3 * y, 1e-3 * z))

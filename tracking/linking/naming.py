@@ -1,7 +1,7 @@
 """Assigning marker names to the dots of a first frame, by the specimen's layout or by row and column."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +19,8 @@ Array = NDArray[Any]
 
 MIN_MATCHED_DOTS = 3
 NEIGHBOUR_GATE = 0.4  # most distance of a dot from its predicted grid position [length of the grid step]
+ON_FACE = 1e-3  # most distance of a marker from the face of a box that it lies on [m]
+GRAZING = 0.17  # cosine of 80 degrees: a camera that looks along a face at less than 10 degrees does not see its dots
 COVERED_SPACINGS = 0.3  # a marker nearer than this to one in front of it in the image is hidden
 DISTANCE_COST = 0.05  # score lost by a dot one spacing from its position in the tried shape; a match scores 1
 # Scores, relative to the largest possible one: the search ends after a group of shapes with GOOD_SCORE, and at once
@@ -35,15 +37,62 @@ def visible_markers(layout: MarkerLayout, camera: Camera) -> NDArray[np.int64]:
     The sides are the flat parts of the layout's convex hull. If the layout lies in one plane, all markers are visible
     that no other one covers.
     """
+    sides = _flat_sides(layout)
+    if sides is None:
+        return _uncovered_markers(layout, camera)
+    normals, on = sides
+    facing = normals @ camera.viewing_direction < -0.5
+    return np.flatnonzero((on & facing).any(axis=1))
+
+
+def _flat_sides(layout: MarkerLayout) -> tuple[Array, NDArray[np.bool_]] | None:
+    """Outward normals (F, 3) of the layout's convex hull, and which markers lie on which of its flat parts, (M, F).
+
+    None if the layout lies in one plane.
+    """
     points = layout.positions
     try:
         hull = ConvexHull(points)
     except (QhullError, ValueError):
-        return _uncovered_markers(layout, camera)
+        return None
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
-    on = np.abs(points @ normals.T + offsets) < 1e-3 * np.ptp(points, axis=0).max()
-    facing = normals @ camera.viewing_direction < -0.5
-    return np.flatnonzero((on & facing).any(axis=1))
+    return normals, np.abs(points @ normals.T + offsets) < 1e-3 * np.ptp(points, axis=0).max()
+
+
+def averted_markers(layout: MarkerLayout, cameras: Iterable[Camera]) -> dict[str, list[str]]:
+    """Markers of the undeformed specimen whose faces look away from every camera: names by face, such as `y-max`.
+
+    The faces are those of the box, or else the flat parts of the layout's convex hull, each named after the side that
+    it looks to most. A marker that lies on none, or on one that a camera sees, is in none of the lists.
+    """
+    if layout.box is not None:
+        normals = np.concatenate([-np.eye(3), np.eye(3)])
+        outside = layout.positions @ normals.T - np.concatenate([np.zeros(3), layout.box])
+        on = np.abs(outside) < ON_FACE
+    elif (sides := _flat_sides(layout)) is not None:
+        normals, on = sides
+    else:
+        return {}
+    away = np.full(on.shape, np.inf)  # least cosine of the angle between a line of sight and a normal
+    for camera in cameras:
+        away = np.minimum(away, _lines_of_sight(camera, layout.positions) @ normals.T)
+    averted = on.any(axis=1) & (~on | (away > -GRAZING)).all(axis=1)
+    result: dict[str, list[str]] = {}
+    for marker, face in enumerate(np.where(on, away, -np.inf).argmax(axis=1)):
+        if averted[marker]:
+            axis = int(np.abs(normals[face]).argmax())
+            side = f"{'xyz'[axis]}-{'max' if normals[face, axis] > 0.0 else 'min'}"
+            result.setdefault(side, []).append(layout.names[marker])
+    return result
+
+
+def _lines_of_sight(camera: Camera, points: Array) -> Array:
+    """Unit vectors away from the camera along the lines of sight through points (M, 3) [m], (M, 3)."""
+    slope = camera.projection_jacobian(points)
+    along = np.cross(slope[:, 0], slope[:, 1])
+    along *= np.sign(along @ camera.viewing_direction)[:, None]
+    result: Array = along / np.linalg.norm(along, axis=1, keepdims=True)
+    return result
 
 
 def with_face_planes(rig: Rig, layout: MarkerLayout) -> Rig:
@@ -134,7 +183,8 @@ def name_by_layout(dots: Array, layout: MarkerLayout, camera: Camera, source: st
     if matched < MIN_MATCHED_DOTS:
         raise InputError(
             f"{source}: expected dots in the pattern of the specimen's markers, found {matched} of "
-            f"{len(markers)} that match; check --specimen, and that calib.yaml belongs to this set-up"
+            f"{len(markers)} that match; check --specimen, and that calib.yaml belongs to this set-up "
+            "(compare the images in rafl-review calib.yaml with the film)"
         )
     indices: list[int] = names.tolist()
     return indices

@@ -75,6 +75,11 @@ def frame_rate(time: Array) -> float:
     return 1.0 / float(np.median(np.diff(time)))
 
 
+def clock_text(delay: float, rate: float) -> str:
+    """A delay [s] in seconds, as in `time_offset_s` of calib.yaml, and in frames at a rate [1/s]."""
+    return f"{delay:+.6f} s ({delay * rate:+.2f} frames)"
+
+
 def slow_motion_note(video: Video, time: Array) -> list[str]:
     """A note on a video whose timestamps (T) [s] play it more slowly than it was recorded, if they do."""
     played, recorded = frame_rate(time), video.capture_fps
@@ -172,9 +177,11 @@ def late_starts(
     notes = []
     for camera, relative in found.items():
         offset = offsets[first] + relative
-        frames = (offset - offsets[camera]) * frame_rate(times[camera])
+        delay = offset - offsets[camera]
+        frames = delay * frame_rate(times[camera])
         if abs(frames) > LEAST_DELAY_FRAMES:
-            began = f"by the motion, {camera} began {abs(frames):.1f} frames {'later' if frames < 0.0 else 'earlier'}"
+            when = "later" if delay < 0.0 else "earlier"
+            began = f"by the motion, {camera} began {abs(frames):.1f} frames ({abs(delay):.3f} s) {when}"
             if alike:
                 notes.append(f"{began} than {first}; unless a trigger started them together, track with --sync")
             else:

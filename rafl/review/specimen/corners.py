@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from rafl.calibration.camera import Camera
 from rafl.calibration.rig import Rig
+from rafl.calibration.summary import OTHER_SET_UP
 from rafl.common.errors import InputError
 
 Array = NDArray[Any]
@@ -64,7 +65,8 @@ def measure_body(rig: Rig, corners: dict[str, Array]) -> MeasuredBody:
         if distance > MAX_ORIGIN_MM:
             remarks.append(
                 f"camera {name}: the lower corner at the clamp is {distance:.1f} mm from the world's origin; if you "
-                "hit it, the calibration's world is not the specimen's frame: check the poses in board.yaml"
+                "hit it, the calibration's world is not the specimen's frame (check the poses in board.yaml), or "
+                f"{OTHER_SET_UP}"
             )
     sizes = [round(float(np.mean(found[axis])), 1) if found[axis] else _between_planes(rig, axis) for axis in range(3)]
     words = [word for word, size in zip(("length", "width", "height"), sizes, strict=True) if size is None]

@@ -234,7 +234,7 @@ def test_tracks_need_no_registration_but_must_be_in_the_specimen_frame(
     item = build(small_specimen, tmp_path).trajectories["q0"]
     np.testing.assert_array_equal(item.markers, moving)
     write_q0_tracks(small_specimen, tmp_path, moving + np.array([0.0, 0.02, 0.0]), sigma)
-    with pytest.raises(InputError, match="world is the specimen's frame"):
+    with pytest.raises(InputError, match="world is not the specimen's frame, or the calibration belongs to another"):
         build(small_specimen, tmp_path)
 
 
@@ -328,6 +328,11 @@ def test_a_dot_far_from_its_description_is_found_and_named(
     assert build(replace(specimen, material=small_specimen.material), tmp_path).markers.moved is None
     (line,) = warnings(built)
     assert line.startswith(f"marker {layout.names[0]}: found ")
+    more = built.markers.moved + np.where(np.arange(len(layout.names))[:, None] < 4, [3e-3, 0.0, 0.0], 0.0)
+    (line,) = warnings(replace(built, markers=replace(built.markers, moved=more)))
+    assert line.startswith("markers found far from their at_mm in the first frames, in mm: ")
+    assert f"{layout.names[3]} 3.0. Correct at_mm" in line
+    assert "the calibration belongs to another set-up" in line
     write_dataset(tmp_path / "small.h5", built)
     again = read_dataset(tmp_path / "small.h5").markers
     for key in ("rest", "moved", "place_sigma"):

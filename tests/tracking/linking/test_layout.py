@@ -28,6 +28,9 @@ def test_grids_give_the_canonical_beam(tmp_path: Path) -> None:
     found, typed = read_layout(path), read_layout(ROOT / "datasets" / "specimens" / "canonical.yaml")
     assert found.names == typed.names
     np.testing.assert_allclose(found.positions, typed.positions, atol=1e-12)
+    assert typed.box == pytest.approx((0.1, 0.03, 0.03))
+    assert found.box is None
+    assert read_layout(ROOT / "datasets" / "specimens" / "fishtail-fine.yaml").box is None
     np.testing.assert_allclose(found.sigma, [0.5e-3] * 16 + [0.2e-3] * 16)
 
 

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -7,7 +9,13 @@ from rafl.calibration.camera import OrthographicCamera, PinholeCamera
 from rafl.calibration.rig import Rig
 from rafl.common.errors import InputError
 from rafl.tracking.linking.layout import MarkerLayout, read_layout
-from rafl.tracking.linking.naming import name_by_layout, name_by_rows, visible_markers, with_face_planes
+from rafl.tracking.linking.naming import (
+    averted_markers,
+    name_by_layout,
+    name_by_rows,
+    visible_markers,
+    with_face_planes,
+)
 
 CAMERA = OrthographicCamera(
     image_size=(1280, 720), scale=(9000.0, 9000.0), rotation_vector=(np.pi / 2, 0.0, 0.0), offset=(150.0, 400.0)
@@ -43,6 +51,42 @@ def test_only_the_near_side_is_visible() -> None:
     assert visible_markers(LAYOUT, CAMERA).tolist() == list(range(16))
     one_plane = MarkerLayout(LAYOUT.names[:16], LAYOUT.positions[:16])
     assert len(visible_markers(one_plane, CAMERA)) == 16
+
+
+def camera_from_above(turn_deg: float, distance: float | None = None) -> OrthographicCamera | PinholeCamera:
+    """CAMERA, or a pinhole camera at a distance [m] from the beam, turned to look down on it."""
+    turn = Rotation.from_rotvec([-np.radians(turn_deg), 0.0, 0.0]).as_matrix()
+    rotation = CAMERA.rotation @ turn.T
+    vector = tuple(Rotation.from_matrix(rotation).as_rotvec().tolist())
+    if distance is None:
+        return replace(CAMERA, rotation_vector=vector)
+    translation = np.array([0.0, 0.0, distance]) - rotation @ LAYOUT.positions.mean(axis=0)
+    return PinholeCamera(
+        image_size=(1280, 720),
+        rotation_vector=vector,
+        focal=(3000.0, 3000.0),
+        centre=(640.0, 360.0),
+        translation=tuple(translation.tolist()),
+    )
+
+
+@pytest.mark.parametrize("distance", [None, 0.3])
+@pytest.mark.parametrize("turn_deg", [0.0, 30.0])
+def test_markers_that_look_away_from_every_camera(turn_deg: float, distance: float | None) -> None:
+    """A camera that looks down on the beam sees its top, on which there are no markers, but none of its far side."""
+    beam = replace(LAYOUT, box=(0.1, 0.03, 0.03))
+    camera = camera_from_above(turn_deg, distance)
+    assert camera.viewing_direction[2] == pytest.approx(-np.sin(np.radians(turn_deg)), abs=1e-9)
+    assert averted_markers(beam, [camera]) == {"y-max": list(LAYOUT.names[16:])}
+    behind = Rotation.from_matrix(CAMERA.rotation @ np.diag([-1.0, -1.0, 1.0]))
+    opposite = replace(CAMERA, rotation_vector=tuple(behind.as_rotvec().tolist()))
+    assert averted_markers(beam, [camera, opposite]) == {}
+
+
+def test_the_hull_tells_what_looks_away_from_every_camera() -> None:
+    assert averted_markers(LAYOUT, [CAMERA]) == {"y-max": list(LAYOUT.names[16:])}
+    one_plane = MarkerLayout(LAYOUT.names[:16], LAYOUT.positions[:16])
+    assert averted_markers(one_plane, [CAMERA]) == {}
 
 
 @pytest.mark.parametrize("name", ["fishtail-crude", "fishtail-fine"])

@@ -63,7 +63,7 @@ def test_a_camera_that_began_later_is_found_by_its_missing_frames(random: np.ran
     offsets, (note,) = late_starts(RIG, pixels, {"side": TIME, "askew": TIME[:-5]})
     assert offsets == {"side": 0.0, "askew": pytest.approx(-0.05, abs=2e-4)}
     assert note.startswith("the cameras recorded 120 (side), 115 (askew) frames;")
-    assert note.endswith("by the motion, askew began 5.0 frames later: corrected")
+    assert note.endswith("by the motion, askew began 5.0 frames (0.050 s) later: corrected")
 
 
 def test_a_camera_that_began_later_and_stopped_later_is_asked_about(random: np.random.Generator) -> None:
@@ -71,7 +71,7 @@ def test_a_camera_that_began_later_and_stopped_later_is_asked_about(random: np.r
     pixels = {"side": project_with_noise(SIDE, TIME, random), "askew": project_with_noise(ASKEW, TIME + 0.05, random)}
     offsets, (note,) = late_starts(RIG, pixels, times)
     assert offsets == {"side": 0.0, "askew": 0.0}
-    assert note.startswith("by the motion, askew began 5.0 frames later than side; unless a trigger")
+    assert note.startswith("by the motion, askew began 5.0 frames (0.050 s) later than side; unless a trigger")
     together = {"side": pixels["side"], "askew": project_with_noise(ASKEW, TIME, random)}
     assert late_starts(RIG, together, times) == ({"side": 0.0, "askew": 0.0}, [])
     still = {name: project_with_noise(camera, 0 * TIME, random) for name, camera in (("side", SIDE), ("askew", ASKEW))}
