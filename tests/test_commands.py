@@ -35,9 +35,9 @@ def test_help_has_an_example(command: str, run: Run) -> None:
     assert f"Example: {command} " in " ".join(result.stdout.split())
 
 
-def write_still(path: Path, size_factor: float = 1.0) -> None:
+def write_still(path: Path, size_factor: float = 1.0, places_mm: np.ndarray = SIDES) -> None:
     """A CSV file of `rafl-track` that shows a box at rest, with dots on its sides."""
-    recording = still(SIDES)
+    recording = still(places_mm)
     assert recording.names is not None
     table = marker_table(recording.time, recording.names, size_factor * recording.position)
     for axis, sigma in zip("xyz", np.moveaxis(1e3 * recording.sigma, -1, 0), strict=True):
@@ -63,7 +63,7 @@ def test_a_still_gives_a_specimen_that_reads_back(run: Run, tmp_path: Path) -> N
 
 def test_specimen_refuses_wrong_input(run: Run, tmp_path: Path) -> None:
     write_still(tmp_path / "still.csv")
-    write_still(tmp_path / "large.csv", 2.0)
+    write_still(tmp_path / "large.csv", 2.0, SIDES[::4])
     (tmp_path / "bad.h5").write_text("not tracks")
     before = folder_content(tmp_path)
     for parts, arguments in (

@@ -21,7 +21,7 @@ def test_rendered_videos_to_fitted_model(specimen_file: Path, run: Run, tmp_path
         assert result.returncode == 0, result.stdout + result.stderr
         return result.stdout
 
-    options = ("--loads-g", "60,90,75", "--frames", "16", "--youngs-modulus", "300000", "--poissons-ratio", "0.47")
+    options = ("--loads-g", "60,90,75", "--frames", "12", "--youngs-modulus", "300000", "--poissons-ratio", "0.47")
     text = output("rafl-render", specimen_file, "--out", "film", *options)
     assert "next: rafl-calibrate" in text
     text = output("rafl-calibrate", "film/calibration", "--out", "calib.yaml")

@@ -1,5 +1,6 @@
 """Help and refusals of wrong arguments answer without importing heavy packages; options agree with the library."""
 
+import json
 import subprocess
 import sys
 from pathlib import Path
@@ -16,15 +17,27 @@ from rafl.tracking import cli as tracking_cli
 from rafl.tracking.reconstruction.export import WRITERS
 
 HEAVY = {"cv2", "fastapi", "h5py", "matplotlib", "numba", "numpy", "pandas", "scipy", "sympy", "torch", "trimesh"}
+# Imports the modules of some scripts, then runs each command line in a fork. Prints the exit code and the imported
+# modules of the imports alone, then of each line.
 PROGRAM = """
-import sys
+import json, os, sys
 from importlib.metadata import entry_points
-sys.argv = sys.argv[1:]
-(script,) = entry_points(group="console_scripts", name=sys.argv[0])
-try:
-    script.load()()
-finally:
-    print("imported:", *sys.modules, file=sys.stderr)
+names, lines = json.loads(sys.argv[1])
+scripts = {script.name: script.load() for script in entry_points(group="console_scripts") if script.name in names}
+output = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)
+print(json.dumps([0, *sys.modules]), file=output, flush=True)
+for line in lines:
+    child = os.fork()
+    if not child:
+        sys.argv, code = line, 0
+        try:
+            scripts[line[0]]()
+        except SystemExit as end:
+            code = end.code
+        print(json.dumps([code, *sys.modules]), file=output, flush=True)
+        os._exit(0)
+    os.waitpid(child, 0)
 """
 
 REFUSED = [
@@ -55,21 +68,40 @@ REFUSED = [
 COMMANDS = sorted({line[0] for line in REFUSED})
 
 
-def imported(line: list[str], folder: Path, code: int) -> set[str]:
-    """The modules that a command has imported when it ends, with this exit code."""
-    done = subprocess.run([sys.executable, "-c", PROGRAM, *line], cwd=folder, capture_output=True, text=True)
-    assert done.returncode == code, done.stderr
-    return set(done.stderr.rpartition("imported: ")[2].split())
+Imported = dict[str, tuple[int, set[str]]]
+HELP = [[name, "--help"] for name in COMMANDS]
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_imports_nothing_heavy(name: str, tmp_path: Path) -> None:
-    assert not imported([name, "--help"], tmp_path, 0) & HEAVY
+@pytest.fixture(scope="module")
+def imported(tmp_path_factory: pytest.TempPathFactory) -> Imported:
+    """Exit code and imported modules at the end of every command line, and of the imports alone, with the key ""."""
+    lines = [*HELP, *REFUSED]
+    program = [sys.executable, "-c", PROGRAM, json.dumps([COMMANDS, lines])]
+    folder = tmp_path_factory.mktemp("startup")
+    done = subprocess.run(program, cwd=folder, capture_output=True, text=True, check=True)
+    found = [json.loads(line) for line in done.stdout.splitlines()]
+    names = ["", *(" ".join(line) for line in lines)]
+    return {name: (code, set(modules)) for name, (code, *modules) in zip(names, found, strict=True)}
+
+
+def test_modules_of_commands_import_nothing_heavy(imported: Imported) -> None:
+    _, modules = imported[""]
+    assert "rafl.capture.cli" in modules
+    assert not modules & HEAVY
+
+
+@pytest.mark.parametrize("line", HELP, ids=" ".join)
+def test_help_imports_nothing_heavy(line: list[str], imported: Imported) -> None:
+    code, modules = imported[" ".join(line)]
+    assert code == 0
+    assert not modules & HEAVY
 
 
 @pytest.mark.parametrize("line", REFUSED, ids=" ".join)
-def test_refusal_imports_nothing_heavy(line: list[str], tmp_path: Path) -> None:
-    assert not imported(line, tmp_path, 2) & HEAVY
+def test_refusal_imports_nothing_heavy(line: list[str], imported: Imported) -> None:
+    code, modules = imported[" ".join(line)]
+    assert code == 2
+    assert not modules & HEAVY
 
 
 def test_laws_of_the_package_need_no_sympy(tmp_path: Path) -> None:

@@ -12,6 +12,13 @@ ENERGY_ROUNDING = 1e-13  # rounding error of an energy, relative to the sum of t
 
 
 @njit(**EXACT_KERNEL_OPTIONS)
+def _copy_values(source, target):
+    """Copy an array. Numba compiles an assignment to a row with texts for errors of shape, which take seconds."""
+    for i in range(len(target)):
+        target[i] = source[i]
+
+
+@njit(**EXACT_KERNEL_OPTIONS)
 def trial_positions(q, rows, free, step, length):
     """Trial positions (P, 3 N) of the trajectories `rows` (P) of q (B, 3 N).
 
@@ -19,7 +26,7 @@ def trial_positions(q, rows, free, step, length):
     """
     trial = np.empty((len(rows), q.shape[1]))
     for p in range(len(rows)):
-        trial[p] = q[rows[p]]
+        _copy_values(q[rows[p]], trial[p])
         for k in range(len(free)):
             trial[p, free[k]] += length[p] * step[p, k]
     return trial
@@ -123,9 +130,9 @@ def accept_trials(
         if accepted:
             shrinking = min(max(size / largest[b], 1e-300), 1.0)
             ready[b] = np.log(max(size / tolerance[b], 1.0)) <= -factorisation_cost * np.log(shrinking)
-            q[b] = trial[p]
+            _copy_values(trial[p], q[b])
             energy[b], largest[b] = total, size
-            residual[b] = own
+            _copy_values(own, residual[b])
         else:
             again[p] = not reused[p]
             ready[b] = ready[b] and not reused[p]

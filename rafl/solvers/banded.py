@@ -53,7 +53,7 @@ class BandedCholesky:
         pivots = np.empty(len(rows))
         factor_bands(
             stiffness.reshape(len(rows), -1),
-            diagonal,
+            np.ascontiguousarray(diagonal),  # one layout, for which the kernel is compiled once
             self.unknowns.entries,
             self._destination,
             rows,

@@ -228,6 +228,7 @@ def test_perspective_is_detected(random: np.random.Generator) -> None:
         solve_one(views_of(side_camera(), random), model="pinhole")
 
 
+@pytest.mark.slow
 def test_mirrored_rigs_are_never_accepted() -> None:
     """Random cameras and views are either solved correctly or refused."""
     refused = 0

@@ -48,7 +48,7 @@ LOADS = {"take1": 0.04, "take2": 0.06, "take3": 0.08}  # [kg]
 SPLITS = dict(zip(LOADS, ("train", "val", "test"), strict=True))
 
 SPECIMEN = (
-    SMALL_SPECIMEN
+    SMALL_SPECIMEN.replace("element_mm: 10", "element_mm: 20")
     + """  - {name: L, face: y-min, at_mm: [10, 0, 14], rows: 2, columns: 4, spacing_mm: [12, 8]}
   - {name: R, face: y-max, at_mm: [10, 20, 14], rows: 2, columns: 4, spacing_mm: [12, 8]}
 """
@@ -86,7 +86,7 @@ def make_laboratory(folder: Path) -> None:
     (folder / "names.csv").write_text("file,specimen\nL1,L1\nL2,L2\n")
     trimesh.creation.box((40.0, 20.0, 20.0)).export(folder / "body.stl")
     (folder / "body.yaml").write_text(
-        SPECIMEN.replace("{box_mm: [60, 20, 20], element_mm: 10}", "{surface: body.stl, element_mm: 10}")
+        SPECIMEN.replace("{box_mm: [60, 20, 20], element_mm: 20}", "{surface: body.stl, element_mm: 10}")
     )
     (folder / "plan.yaml").write_text(PLAN)
     (folder / "cluster.yaml").write_text(CLUSTER)

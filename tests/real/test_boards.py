@@ -21,6 +21,7 @@ def description(simultaneous: bool, **pattern: object) -> BoardFile:
     return BoardFile.model_validate({"format": "rafl-board/1", "pattern": pattern, "simultaneous": simultaneous})
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not CHESSBOARD.is_dir(), reason=f"no photographs in {CHESSBOARD}")
 def test_handheld_chessboard_calibrates_a_pinhole() -> None:
     """The board has 14 x 19 inner corners. OpenCV's calibrateCamera leaves 0.30 px in each coordinate."""

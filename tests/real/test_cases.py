@@ -57,6 +57,7 @@ def test_a_gap_after_the_release_is_no_rest(run: Run, tmp_path: Path) -> None:
         assert {int(item.attrs["first_frame"]) for item in file["trajectories"].values()} == {0}
 
 
+@pytest.mark.slow
 def test_no_interval_where_the_frame_was_found_through_the_model(run: Run, tmp_path: Path) -> None:
     """The table of the recordings has a first line that names the separator."""
     told = capture(run, CASES / "c3d-frame-through-model" / "in", CASES / "csv-sep-line" / "recordings.csv")

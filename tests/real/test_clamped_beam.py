@@ -39,6 +39,7 @@ def test_identified_material_reduces_the_error_on_the_held_out_recording(run: Ru
     assert errors["mean_mm"]["sysid"] < 0.7 * errors["mean_mm"]["original"]
 
 
+@pytest.mark.slow
 def test_detected_release_agrees_with_the_study(run: Run, tmp_path: Path) -> None:
     """The release is within two frames of the first frame that the original study of the recordings chose by hand."""
     table = pd.read_csv(SPECIMENS / "clamped_beam_recordings.csv")

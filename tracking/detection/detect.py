@@ -113,9 +113,19 @@ def relative_contrast(contrast: Any, level: Any) -> Any:
 
 @njit(cache=True, nogil=True)
 def _fit_range(
-    image: Array, starts: Array, first: int, last: int, robust: bool, fitted: Array, statistics: Array
+    image: Array,
+    deep_image: Array,
+    starts: Array,
+    first: int,
+    last: int,
+    robust: bool,
+    fitted: Array,
+    statistics: Array,
 ) -> None:
-    """Fit starts[first:last] of starts (D, 12); fills fitted (D, 12) and statistics (D, STATISTIC_COUNT)."""
+    """Fit starts[first:last] of starts (D, 12); fills fitted (D, 12) and statistics (D, STATISTIC_COUNT).
+
+    image, deep_image: see `fit_disc`.
+    """
     count = starts.shape[0]
     scratch = np.empty(SCRATCH_SIZE, np.float32)
     radius = 1.0 / np.sqrt(np.abs(starts[:, 2] * starts[:, 4] - starts[:, 3] ** 2))
@@ -123,7 +133,8 @@ def _fit_range(
     quality = np.empty(QUALITY_COUNT)
     for k in range(first, last):
         found = 0
-        fitted[k] = starts[k]
+        for i in range(PARAMETER_COUNT):  # see `disc_fit` on copies
+            fitted[k, i] = starts[k, i]
         for other in range(count):
             distance = np.hypot(starts[other, 0] - starts[k, 0], starts[other, 1] - starts[k, 1])
             if other != k and found < 16 and distance < 1.6 * radius[k] + radius[other] + 10.0:
@@ -131,7 +142,7 @@ def _fit_range(
                 near[found, 1] = starts[other, 1]
                 near[found, 2] = radius[other]
                 found += 1
-        fit_disc(image, fitted[k], near[:found], robust, scratch, quality)
+        fit_disc(image, deep_image, fitted[k], near[:found], robust, scratch, quality)
         _describe(fitted[k], quality, statistics[k])
 
 
@@ -171,24 +182,29 @@ def fit_dots(image: Array, starts: Array, fit_count: int | None = None, robust: 
         robust: give less weight to pixels that the initial parameters do not explain.
     """
     starts = np.ascontiguousarray(starts)
+    if image.dtype == np.uint8:
+        images = np.ascontiguousarray(image), np.zeros((0, 0), np.float32)
+    else:
+        images = np.zeros((0, 0), np.uint8), np.ascontiguousarray(image, np.float32)
     count = len(starts) if fit_count is None else fit_count
     fitted, statistics = np.empty((count, PARAMETER_COUNT)), np.empty((count, STATISTIC_COUNT))
     half = count // 2 if count >= MIN_DOTS_FOR_TWO_THREADS else 0
-    other = _POOL.submit(_fit_range, image, starts, 0, half, robust, fitted, statistics) if half else None
-    _fit_range(image, starts, half, count, robust, fitted, statistics)
+    other = _POOL.submit(_fit_range, *images, starts, 0, half, robust, fitted, statistics) if half else None
+    _fit_range(*images, starts, half, count, robust, fitted, statistics)
     if other is not None:
         other.result()
+    columns = statistics.T.copy()  # contiguous, as chosen dots are: kernels are compiled for one layout only
     return Dots(
-        centre=fitted[:, :2],
-        sigma=statistics[:, :2],
+        centre=fitted[:, :2].copy(),
+        sigma=statistics[:, :2].copy(),
         parameters=fitted,
-        radius=statistics[:, 2],
-        relative_radius_sigma=statistics[:, 6],
-        axis_ratio=statistics[:, 3],
-        contrast=fitted[:, 8],
-        residual=statistics[:, 4],
-        misfit=statistics[:, 7],
-        mean_weight=statistics[:, 5],
+        radius=columns[2],
+        relative_radius_sigma=columns[6],
+        axis_ratio=columns[3],
+        contrast=fitted[:, 8].copy(),
+        residual=columns[4],
+        misfit=columns[7],
+        mean_weight=columns[5],
     )
 
 
@@ -289,9 +305,11 @@ def _blob_moments(labels: Array, count: int) -> tuple[Array, Array, Array, Array
                 box[label, 1], box[label, 3] = min(box[label, 1], y), y + 1
     mean = sums / np.maximum(area, 1).reshape(-1, 1)
     covariance = np.empty((count, 2, 2))
-    covariance[:, 0, 0] = mean[:, 2] - mean[:, 0] ** 2
-    covariance[:, 0, 1] = covariance[:, 1, 0] = mean[:, 3] - mean[:, 0] * mean[:, 1]
-    covariance[:, 1, 1] = mean[:, 4] - mean[:, 1] ** 2
+    for label in range(count):
+        x, y = mean[label, 0], mean[label, 1]
+        covariance[label, 0, 0] = mean[label, 2] - x * x
+        covariance[label, 0, 1] = covariance[label, 1, 0] = mean[label, 3] - x * y
+        covariance[label, 1, 1] = mean[label, 4] - y * y
     return box, area, mean[:, :2].copy(), covariance
 
 

@@ -1,4 +1,7 @@
-"""Fit discs to pixels: weigh the pixels, and find out whether the disc moved far during the exposure."""
+"""Fit discs to pixels: weigh the pixels, and find out whether the disc moved far during the exposure.
+
+Arrays are copied in loops. Numba compiles an assignment to a slice with texts for errors of shape, which take seconds.
+"""
 
 from typing import Any
 
@@ -25,7 +28,7 @@ from rafl.tracking.detection.disc_model import (
     select_pixels,
     split_motion_blur,
 )
-from rafl.tracking.detection.levenberg_marquardt import minimise
+from rafl.tracking.detection.levenberg_marquardt import QUALITY_COUNT, minimise
 from rafl.tracking.detection.normal_equations import add_products, normal_equations
 
 OUTLIER_RESIDUAL = 0.12  # fraction of the contrast: a pixel with a larger residual shows something else than the dot
@@ -102,20 +105,22 @@ def _exclude_around_unexplained(reach, count, w):
 
 
 @njit(**FAST)
-def fit_disc(image, p, near, robust, w, quality):
+def fit_disc(image, deep_image, p, near, robust, w, quality):
     """Fit a disc, from the initial parameters p (12); fills p with the result, and quality (QUALITY_COUNT).
 
+    image, deep_image: 8-bit and float32 grey levels, one of them empty: one signature, so that this is compiled once.
     near (K, 3): centre and radius of other dots. robust: reduce the weight of pixels that the initial parameters do not
     explain. w (SCRATCH_SIZE), float32: scratch array.
     """
     start = p.copy()
-    while _fit(image, p, near, robust, w, quality):  # the initial parameters may be wrong instead of the pixels
-        p[:] = start
-        robust = False  # with which the fit has no unexplained pixels
+    while _fit(image, deep_image, p, near, robust, w, quality):
+        for i in range(PARAMETER_COUNT):  # the initial parameters may be wrong instead of the pixels
+            p[i] = start[i]
+        robust = not robust  # now False, with which the fit has no unexplained pixels
 
 
 @njit(**FAST)
-def _fit(image, p, near, robust, w, quality):
+def _fit(image, deep_image, p, near, robust, w, quality):
     """Fit once, see `fit_disc`; returns True if the fit fails and some pixels counted as unexplained."""
     n = PARAMETER_COUNT
     quality[:] = 0.0
@@ -130,7 +135,7 @@ def _fit(image, p, near, robust, w, quality):
     y0 = 0
     for _ in range(4):  # select the pixels again if the disc has moved away from them
         x0, y0 = int(np.rint(p[0])), int(np.rint(p[1]))
-        count = select_pixels(image, p, near, w)
+        count = select_pixels(image, p, near, w) if image.size else select_pixels(deep_image, p, near, w)
         if count < 3 * n:
             return False
         unexplained, tolerance = _initial_weights(p, x0, y0, count, robust, w, H)
@@ -148,7 +153,10 @@ def _fit(image, p, near, robust, w, quality):
         normal_equations(p, instants, x0, y0, count, w, H)
         if not minimise(p, instants, x0, y0, count, w, H, L, quality):  # a small dot's motion may look like its blur
             instants = 1
-            p[:], quality[:] = blurred, before
+            for i in range(n):
+                p[i] = blurred[i]
+            for i in range(QUALITY_COUNT):
+                quality[i] = before[i]
             normal_equations(p, instants, x0, y0, count, w, H)
     if unexplained or _count_above(OUTLIER_RESIDUAL * abs(p[8]), count, w) > 0:
         for _ in range(6):
@@ -186,7 +194,8 @@ def _initial_weights(p, x0, y0, count, robust, w, H):
     if not robust or unexplained < max(4.0, MIN_UNEXPLAINED_FRACTION * count):
         return False, tolerance
     _exclude_around_unexplained(WIDENING_SIGMAS * np.sqrt(0.5 * (p[5] + p[7])), count, w)
-    w[WEIGHT : WEIGHT + count] = w[LEVEL_WEIGHT : LEVEL_WEIGHT + count]
+    for k in range(count):
+        w[WEIGHT + k] = w[LEVEL_WEIGHT + k]
     normal_equations(p, 1, x0, y0, count, w, H)
     return True, tolerance
 

@@ -199,11 +199,13 @@ def minimise(p, instants, x0, y0, count, w, H, L, quality):
             if damping > 1e4:
                 break
             step *= 0.2
-            trial[:] = p + step
+            for i in range(n):
+                trial[i] = p[i] + step[i]
             _clip_edge_variance(trial, instants)
             continue
         best = cost
-        p[:] = trial
+        for i in range(n):
+            p[i] = trial[i]
         damping = max(0.1 * damping, 1e-7)
         for i in range(n):
             step[i] = H[n, i]
@@ -213,19 +215,23 @@ def minimise(p, instants, x0, y0, count, w, H, L, quality):
         gain = 0.0
         for i in range(n):
             gain += step[i] * H[n, i]
-        trial[:] = p + step
+        for i in range(n):
+            trial[i] = p[i] + step[i]
         _clip_edge_variance(trial, instants)
         length = max(abs(step[0]), abs(step[1]))
         final, small = _is_final(length, gain, best, count), _is_small(p, step)
         if not (damping < MAX_FINAL_DAMPING and (final or small)):
             continue
-        candidate[:] = trial
+        for i in range(n):
+            candidate[i] = trial[i]
         length, cost, gain = _assess(trial, instants, x0, y0, count, w, L, quality)
         increase = ACCEPTED_INCREASE if small and length < SHORT_STEP else ROUNDING_INCREASE
         if cost < best * (1.0 + increase) and (final or _is_final(length, gain, cost, count)):
-            p[:] = trial
+            for i in range(n):
+                p[i] = trial[i]
             return True
-        trial[:] = candidate
+        for i in range(n):
+            trial[i] = candidate[i]
     # Rounding hides the remaining gain, or some parameters are poorly determined.
     normal_equations(p, instants, x0, y0, count, w, H)
     if not factorise(H, FALLBACK_DAMPING, L):

@@ -141,7 +141,8 @@ def _hypotheses(
     matches = np.full((len(starts) + 1, len(last)), -1)
     scores = np.full(len(starts) + 1, -np.inf)
     best = 0
-    scores[0] = _grow(mean, covariance, dots, variance, last, unmoved, log_area, -1, -1, least, matches[0])
+    none = int(np.int64(-1))  # no literal, for which `_grow` would be compiled once more
+    scores[0] = _grow(mean, covariance, dots, variance, last, unmoved, log_area, none, none, least, matches[0])
     for s in range(len(starts)):
         marker, dot = starts[s]
         if matches[best, marker] == dot and scores[best] > -np.inf:  # would give the same hypothesis

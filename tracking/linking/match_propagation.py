@@ -126,7 +126,7 @@ def _propagate(shape, spacing, neighbours, dots, distance_cost, seed, match):
             for k in range(neighbours.shape[1]):
                 if neighbours[marker, k] >= 0:
                     matched_neighbours[neighbours[marker, k]] += 1
-        best = -1
+        best = int(np.int64(-1))  # no literal, for which `_predict` would be compiled once more
         for other in range(count):
             if not visited[other] and (best < 0 or matched_neighbours[other] > matched_neighbours[best]):
                 best = other
@@ -169,7 +169,8 @@ def best_match(shape, spacing, neighbours, dots, distance_cost, seeds, sufficien
         score = _propagate(shape, spacing, neighbours, dots, distance_cost, seeds[s], match)
         if score > highest:
             highest = score
-            best[:] = match
+            for marker in range(shape.shape[0]):  # numba takes seconds to compile an assignment to a slice
+                best[marker] = match[marker]
         if highest >= sufficient_score:
             break
     return highest

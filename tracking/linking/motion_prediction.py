@@ -119,8 +119,11 @@ def _update_errors(
 def _append_frame(positions: Array, count: int, stiffness_sums: Array, newest: Array) -> Array:
     """The last positions with the newest ones, (M, 2), appended. Updates `stiffness_sums` (2)."""
     result = np.empty_like(positions)
-    result[:-1] = positions[1:]
-    result[-1] = newest
+    for marker in range(len(newest)):  # numba takes seconds to compile assignments to slices
+        for axis in range(2):
+            for frame in range(1, len(positions)):
+                result[frame - 1, marker, axis] = positions[frame, marker, axis]
+            result[-1, marker, axis] = newest[marker, axis]
     if count == KEPT_FRAMES:
         stiffness_sums *= STIFFNESS_DECAY
         for marker in range(len(newest)):

@@ -319,7 +319,7 @@ def test_killed_writers_leave_the_file_intact(dataset: Dataset, tmp_path: Path) 
     """A process that rewrites the file repeatedly is killed at random times; the file is intact each time."""
     path = tmp_path / "a.h5"
     with_views = filmed(dataset, {"left": side_camera(0.0)}, moving=True)
-    trajectories = {f"r{k}": with_views.trajectories["a"] for k in range(8)}
+    trajectories = {f"r{k}": with_views.trajectories["a"] for k in range(3)}
     write_dataset(path, replace(dataset, trajectories=trajectories))
     result = subprocess.run([sys.executable, "-c", KILL_WRITERS, str(path)], capture_output=True, text=True, check=True)
     assert result.stdout.splitlines() == ["[]"] * 50

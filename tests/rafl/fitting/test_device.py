@@ -25,7 +25,7 @@ SETTINGS = Settings("sysid", ("small.h5",), 2, 2e-3, 1e-5, 10, 12, 5)
 @pytest.fixture
 def short(dataset: Dataset) -> Dataset:
     """The leading frames of one training and one validation recording."""
-    return replace(dataset, trajectories={name: dataset.trajectories[name].first_frames(5) for name in ("a", "c")})
+    return replace(dataset, trajectories={name: dataset.trajectories[name].first_frames(3) for name in ("a", "c")})
 
 
 def in_tensors(dataset: Dataset, device: str) -> Dataset:

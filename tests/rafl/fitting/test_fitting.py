@@ -131,7 +131,7 @@ def test_identification_of_rubber_that_remembers(method: str, small_specimen: Sp
         replace(small_specimen.simulator(0.01, each), integrator="generalised-alpha") for each in (assumed, target)
     )
     starts = loaded_equilibria(lab, mesh.face_nodes("x-max"), np.array([0.04, 0.1]))
-    recorded = release_dataset("small", base, lab, starts, 40, {"a": "train", "b": "train"})
+    recorded = release_dataset("small", base, lab, starts, 25, {"a": "train", "b": "train"})
     model = identify_material([recorded], replace(SETTINGS, method=method, epochs=25, frames=0), tmp_path, ignore)
     assert model.material is not None
     assert model.material["youngs_modulus"] == pytest.approx(190e3, rel=1e-3)

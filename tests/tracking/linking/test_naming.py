@@ -141,8 +141,13 @@ def test_strongly_bent_beams_are_named(name: str, slope_deg: float, hidden: int)
     assert name_by_layout(dots, layout, CAMERA, "a video") == seen.tolist()
 
 
-@pytest.mark.parametrize(("columns", "rows", "along_mm", "across_mm"), [(12, 4, 8, 4), (20, 5, 5, 3)])
-@pytest.mark.parametrize("slope_deg", [-70, -30, 20, 45, 75])
+@pytest.mark.parametrize(
+    ("columns", "rows", "along_mm", "across_mm", "slope_deg"),
+    [
+        *((12, 4, 8, 4, slope_deg) for slope_deg in (-70, -30, 20, 45, 75)),
+        *((20, 5, 5, 3, slope_deg) for slope_deg in (-70, 20, 75)),
+    ],
+)
 def test_strongly_bent_sheets_of_many_dots_are_named(
     columns: int, rows: int, along_mm: float, across_mm: float, slope_deg: float, random: np.random.Generator
 ) -> None:
