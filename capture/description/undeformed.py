@@ -221,7 +221,7 @@ class _ModulusSearch:
         """The deformed body and the dots carried back from it, with log E relative to the assumed material's."""
         material = self.simulator.material
         softened = replace(material, youngs_modulus=material.youngs_modulus * float(np.exp(log_modulus)))
-        simulator = replace(self.simulator, material=softened)
+        simulator = self.simulator.with_material(softened)
         q = simulator.equilibrium(simulator.weight[None], label="the specimen under its own weight")[0]
         return q, carry_back(self.shape, q, self.dots)
 

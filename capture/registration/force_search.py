@@ -268,7 +268,7 @@ def _softened(frame: FirstFrame, log_modulus: float) -> FirstFrame:
         return frame
     material = frame.simulator.material
     modulus = material.youngs_modulus * float(np.exp(log_modulus))
-    return replace(frame, simulator=replace(frame.simulator, material=replace(material, youngs_modulus=modulus)))
+    return replace(frame, simulator=frame.simulator.with_material(replace(material, youngs_modulus=modulus)))
 
 
 def modulus_slope(frame: FirstFrame, q: Array, force: Array) -> Array:

@@ -79,7 +79,7 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
     precision = np.concatenate([[MODULUS_SIGMA**-2.0], by_pose, by_place])
     for _ in range(MAX_ITERATIONS):
         modulus = simulator.material.youngs_modulus * np.exp(log_modulus)
-        softened = replace(simulator, material=replace(simulator.material, youngs_modulus=modulus))
+        softened = simulator.with_material(replace(simulator.material, youngs_modulus=modulus))
         hessian = np.diag(precision)
         gradient = precision * np.concatenate([[log_modulus], np.zeros(6), moved.ravel()])
         for k, frame in enumerate(frames):

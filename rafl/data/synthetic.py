@@ -111,4 +111,4 @@ def release_dataset(
 def with_material(simulator: Simulator, youngs_modulus: float, poissons_ratio: float) -> Simulator:
     """The same specimen with another Young's modulus [Pa] and Poisson's ratio."""
     material = replace(simulator.material, youngs_modulus=youngs_modulus, poissons_ratio=poissons_ratio)
-    return replace(simulator, material=material)
+    return simulator.with_material(material)

@@ -85,6 +85,13 @@ class Simulator:
         require_device(device)
         return replace(self, arithmetic="compiled" if device == CPU else "torch", device=device)
 
+    def with_material(self, material: Material) -> "Simulator":
+        """The simulator of another material; it shares the engine, with its linear solver, if this may be the same."""
+        other = replace(self, material=material)
+        if (material.law, material.integration) == (self.material.law, self.material.integration):
+            other.__dict__["engine"] = self.engine  # where `cached_property` looks for it
+        return other
+
     @property
     def time_integration(self) -> dict[str, Any]:
         """Settings of the time integration, by attribute name."""

@@ -56,6 +56,18 @@ def test_equilibrium_balances_the_weight() -> None:
     assert q[0, -1, 2] < simulator.mesh.vertices[-1, 2]
 
 
+@pytest.mark.parametrize("law", ["projective", "neo-hookean"])
+def test_another_material_has_the_equilibrium_of_a_simulator_of_its_own(law: str) -> None:
+    """It shares the engine where law and integration are the same, and only there."""
+    simulator = beam()
+    softer = Material(mass="lumped", law=law, youngs_modulus=0.5 * simulator.material.youngs_modulus)
+    simulator.equilibrium(simulator.weight[None])
+    other = simulator.with_material(softer)
+    own = Simulator(simulator.mesh, softer, simulator.fixed)
+    np.testing.assert_array_equal(other.equilibrium(other.weight[None]), own.equilibrium(own.weight[None]))
+    assert (other.engine is simulator.engine) == (law == simulator.material.law)
+
+
 @pytest.mark.parametrize("preset", PRESETS)
 def test_equilibrium_under_a_load_that_folds_the_beam(preset: str) -> None:
     """Tip load of fifty times the weight of the beam, applied at once."""
