@@ -7,12 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import FirstFrame
-from rafl.capture.registration.force_search import (
-    Estimate,
-    ForcePrior,
-    ForceSearch,
-    marker_jacobian,
-)
+from rafl.capture.registration.force_search import Estimate, ForcePrior, ForceSearch, marker_jacobian
 from rafl.capture.registration.mesh_error import ASSUMED, EXACT, ErrorSizes, MeshError
 from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 
@@ -145,13 +140,12 @@ def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate, error: MeshEr
     for _ in range(REFITS):
         search = _search(first, prior, error.whitening(sizes), found)
         found = search.minimise(found.force, found.pose, found.q, found.log_modulus)
+        fit = _Fit(search, found, sizes, search.log_evidence(found) + error.log_probability(sizes))
         sigma = error.total_sigma(sizes)
         if 1.0 / SETTLED < sigma / last < SETTLED:
             break
-        last, fitted = sigma, sizes
-        sizes = error.most_probable(*search.linearised(found), sizes)
-    evidence = search.log_evidence(found) + error.log_probability(fitted)
-    return _Fit(search, found, fitted, evidence)
+        last, sizes = sigma, error.most_probable(*search.linearised(found), sizes)
+    return fit
 
 
 def _search(first: ForceSearch, prior: ForcePrior, whitening: Array, found: Estimate) -> ForceSearch:
