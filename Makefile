@@ -145,6 +145,7 @@ bench-places: install
 # One camera or two, compared in the image plane and in space; 95 % intervals from pixels; cameras that were touched.
 bench-image: install
 	$(BIN)/python tests/bench/image_objective.py
+	$(BIN)/python tests/bench/unlike_material.py
 	$(BIN)/python tests/bench/image_intervals.py
 	$(BIN)/python tests/bench/moved_cameras.py
 

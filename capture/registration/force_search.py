@@ -188,6 +188,17 @@ class ForceSearch:
         spread += np.linalg.slogdet(self.whitening @ self.whitening.T)[1]
         return float(0.5 * (spread - found.objective))
 
+    def marker_sigma(self, found: Estimate) -> Array:
+        """Largest standard deviations of the measured markers [m], (M'), in a fit without a pose.
+
+        By Laplace's approximation: the covariance of forces and log E is the inverse of the Gauss-Newton Hessian.
+        """
+        slopes = self._marker_slopes(found)
+        by_unknowns = slopes.reshape(-1, 3, slopes.shape[1])
+        solved = np.linalg.solve(self._normal_equations(found)[1], slopes.T).T.reshape(by_unknowns.shape)
+        sigma: Array = np.sqrt(np.linalg.eigvalsh(by_unknowns @ solved.swapaxes(1, 2))[:, -1])
+        return sigma
+
     def _normal_equations(self, current: Estimate) -> tuple[Array, Array]:
         """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, the pose (6) or log E."""
         jacobian = self.whitening @ self._slopes(current)

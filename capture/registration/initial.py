@@ -70,14 +70,13 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     start, marker_sigma = pose or IDENTITY, np.full(len(frame.target), np.nan)
     error = MeshError.of(frame, start.apply(frame.target[frame.measured]))
     fit = _fit_surface(frame, error, pose) if frame.whole_surface else _fit_tip(frame, error, pose)
-    q = fit.found.q + error.correction(fit.sizes, fit.found.residual)
+    search, found = fit.search, fit.found
     if not frame.whole_surface and pose is None:
-        marker_sigma[frame.measured] = fit.marker_sigma(error)
-    # The same shape of a body with the assumed modulus.
-    force = frame.simulator.elastic_gradient(q[None])[0] - frame.simulator.weight
-    force[frame.simulator.fixed] = 0.0
-    residual = np.sqrt(3.0) * fit.search.rms(fit.found)
-    return InitialState(q, force, residual, fit.found.pose, marker_sigma, fit.search.prior.name)
+        marker_sigma[frame.measured] = np.hypot(search.marker_sigma(found), error.mesh_sigma(fit.sizes))
+    weight = frame.simulator.weight
+    # With the assumed modulus, the same shape needs forces that are larger by the ratio of the moduli.
+    force = np.exp(-found.log_modulus) * (weight + found.force) - weight
+    return InitialState(found.q, force, np.sqrt(3.0) * search.rms(found), found.pose, marker_sigma, search.prior.name)
 
 
 @dataclass(frozen=True)
@@ -95,12 +94,6 @@ class _Fit:
     found: Estimate
     sizes: ErrorSizes
     evidence: float
-
-    def marker_sigma(self, error: MeshError) -> Array:
-        """Largest standard deviations of the measured markers in any direction [m], (M'), by linearisation."""
-        rows, known, precision = self.search.linearised(self.found)
-        covariance = np.linalg.inv(precision + known[:, 1:].T @ known[:, 1:])
-        return error.marker_sigma(self.sizes, rows[:, 1:], covariance)
 
 
 def _fit_surface(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -> _Fit:

@@ -49,23 +49,20 @@ ASSUMED = ErrorSizes(MODEL_FRACTION, 1.0)
 
 @dataclass(frozen=True)
 class MeshError:
-    """The distribution of the specimen's markers about those of the mesh, and of their measurements.
+    """The distribution of the markers' measurements about the markers of the mesh.
 
     Attributes:
-        frame: observation.
+        count: number of measured markers, M'.
         observed: index of each observed axis among the 3 M' of the measured markers, (K).
         sigma: of the measurements along them [m], (K).
-        covariance: of all measured markers along their axes, of a smooth error as large as the deflection [m^2],
-            (3 M', 3 M').
         modes: independent directions of the measurements over `sigma`, the columns of (K, K).
-        variance: of the modes by such an error, (K).
+        variance: of the modes by a smooth error as large as the deflection, (K).
         deflection: root mean square of the measured deflections along the observed axes [m].
     """
 
-    frame: FirstFrame
+    count: int
     observed: NDArray[np.int64]
     sigma: Array
-    covariance: Array
     modes: Array
     variance: Array
     deflection: float
@@ -77,50 +74,27 @@ class MeshError:
         sigma = frame.sigma[frame.measured].ravel()[observed]
         moved = frame.along_axes(target - rest).ravel()[observed]
         deflection = float(np.sqrt((moved**2).mean()))
+        length = CORRELATION_LENGTH * float(np.ptp(frame.simulator.mesh.vertices, axis=0).max())
+        correlation = np.exp(-0.5 * cdist(rest, rest, "sqeuclidean") / length**2)
         axes = np.eye(3)[None].repeat(len(rest), axis=0) if frame.axes is None else frame.axes[frame.measured]
-        alike = np.einsum("mn,mik,njk->minj", _correlation(frame, rest), axes, axes)
-        covariance = deflection**2 * alike.reshape(3 * len(rest), -1)
-        own = covariance[np.ix_(observed, observed)] / np.outer(sigma, sigma)
-        variance, modes = np.linalg.eigh(own)
-        return cls(frame, observed, sigma, covariance, modes, np.maximum(variance, 0.0), deflection)
+        alike = np.einsum("mn,mik,njk->minj", correlation, axes, axes).reshape(3 * len(rest), -1)
+        scaled = deflection**2 * alike[np.ix_(observed, observed)] / np.outer(sigma, sigma)
+        variance, modes = np.linalg.eigh(scaled)
+        return cls(len(rest), observed, sigma, modes, np.maximum(variance, 0.0), deflection)
 
     def whitening(self, sizes: ErrorSizes) -> Array:
         """Matrix (K, 3 M') [1/m] that makes independent numbers of variance one of the markers' residuals."""
-        result = np.zeros((len(self.observed), len(self.covariance)))
+        result = np.zeros((len(self.observed), 3 * self.count))
         result[:, self.observed] = self.modes.T / self.sigma
         return result / np.sqrt(self._mode_variance(sizes))[:, None]
 
+    def mesh_sigma(self, sizes: ErrorSizes) -> float:
+        """Standard deviation of a marker about that of the mesh in any direction, less its measurement [m]."""
+        return float(np.hypot(sizes.smooth * self.deflection, sizes.single * np.sqrt((self.sigma**2).mean())))
+
     def total_sigma(self, sizes: ErrorSizes) -> float:
         """Root mean square standard deviation of a measurement about the mesh [m]."""
-        by_single = (1.0 + sizes.single**2) * float((self.sigma**2).mean())
-        return float(np.sqrt((sizes.smooth * self.deflection) ** 2 + by_single))
-
-    def correction(self, sizes: ErrorSizes, residual: Array) -> Array:
-        """The most probable smooth error of the nodes [m], (N, 3): what to add to those of the mesh.
-
-        residual: markers of the mesh minus measured markers along their axes [m], (3 M').
-        """
-        frame, whitening = self.frame, self.whitening(sizes)
-        weighted = (whitening.T @ (whitening @ residual)).reshape(-1, 3)
-        along = weighted if frame.axes is None else np.einsum("mij,mi->mj", frame.axes[frame.measured], weighted)
-        moved = np.asarray(-_correlation(frame, frame.simulator.mesh.vertices) @ along)
-        moved[frame.simulator.fixed] = 0.0
-        return (sizes.smooth * self.deflection) ** 2 * moved
-
-    def marker_sigma(self, sizes: ErrorSizes, slopes: Array, covariance: Array) -> Array:
-        """Largest standard deviations of the specimen's measured markers in any direction [m], (M').
-
-        Args:
-            sizes: of the error.
-            slopes: derivatives of the mesh's markers along their axes by unknowns [m], (3 M', U).
-            covariance: of the unknowns before the measurement, (U, U).
-        """
-        before = slopes @ covariance @ slopes.T + sizes.smooth**2 * self.covariance
-        seen = before[:, self.observed]
-        measured = seen[self.observed] + np.diag((1.0 + sizes.single**2) * self.sigma**2)
-        after = before - seen @ np.linalg.solve(measured, seen.T)
-        blocks = np.einsum("mimj->mij", after.reshape(len(before) // 3, 3, -1, 3))
-        return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(blocks)[:, -1], 0.0)))
+        return float(np.hypot(self.mesh_sigma(sizes), np.sqrt((self.sigma**2).mean())))
 
     def log_probability(self, sizes: ErrorSizes) -> float:
         """Logarithm of how probable the sizes are beforehand, up to a constant."""
@@ -163,10 +137,3 @@ class MeshError:
         """Of the sizes over the assumed ones."""
         result: Array = np.log(np.maximum(sizes.values / ASSUMED.values, LEAST_FACTOR))
         return result
-
-
-def _correlation(frame: FirstFrame, points: Array) -> Array:
-    """Correlation of the smooth error at undeformed points (P, 3) with that at the measured markers, (P, M')."""
-    length = CORRELATION_LENGTH * float(np.ptp(frame.simulator.mesh.vertices, axis=0).max())
-    square = cdist(points, frame.markers.rest[frame.measured], "sqeuclidean")
-    return np.asarray(np.exp(-0.5 * square / length**2))

@@ -127,7 +127,7 @@ def test_a_camera_that_began_later(run: Run) -> None:
     videos = CASES / "video-late-camera" / "videos"
     result = run("rafl-track", videos, "--calib", CALIB, "--specimen", SPECIMEN, "--out", "tracks")
     assert result.returncode == 0, result.stderr
-    assert "right began 5.0 frames later" in result.stdout
+    assert "right began 5.0 frames (0.050 s) later" in result.stdout
 
 
 def test_frames_that_a_camera_showed_again(run: Run) -> None:

@@ -10,7 +10,7 @@ from filmed_markers import side_camera
 from rafl.capture.registration.averaging import average_views
 from rafl.capture.registration.first_frame import FirstFrame
 from rafl.capture.registration.initial import WEIGHT, fit_first_frame
-from rafl.capture.registration.mesh_error import CORRELATION_LENGTH, EXACT, ErrorSizes, MeshError
+from rafl.capture.registration.mesh_error import CORRELATION_LENGTH, ErrorSizes, MeshError
 from rafl.capture.specimen.specimen import Specimen
 from rafl.data.views import View
 
@@ -38,45 +38,25 @@ def error(frame: FirstFrame) -> MeshError:
     return MeshError.of(frame, frame.target)
 
 
-def dense_covariance(frame: FirstFrame, points: np.ndarray) -> np.ndarray:
-    """Covariance of the smooth error at points (P, 3) with that along the observed axes, (3 P, K)."""
-    assert frame.axes is not None
-    rest, vertices = frame.markers.rest, frame.simulator.mesh.vertices
-    moved = np.einsum("mij,mj->mi", frame.axes, frame.target - rest)[frame.observed_axes]
-    size = SIZES.smooth**2 * (moved**2).mean()
-    length = CORRELATION_LENGTH * np.ptp(vertices[:, 0])
-    columns = []
-    for marker, axis in np.argwhere(frame.observed_axes):
-        distance = np.linalg.norm(points - rest[marker], axis=1)
-        alike = size * np.exp(-(distance**2) / (2.0 * length**2))
-        columns.append((alike[:, None] * frame.axes[marker, axis]).ravel())
-    return np.stack(columns, axis=1)
-
-
 def measured_covariance(frame: FirstFrame) -> np.ndarray:
     """Covariance of the measurements about the mesh, (K, K), by its definition."""
     assert frame.axes is not None
     rest = frame.markers.rest
-    smooth = dense_covariance(frame, rest).reshape(len(rest), 3, -1)
-    along = np.einsum("mij,mjk->mik", frame.axes, smooth)[frame.observed_axes]
-    sigma = frame.sigma[frame.observed_axes]
-    return along + np.diag((1.0 + SIZES.single**2) * sigma**2)
+    moved = np.einsum("mij,mj->mi", frame.axes, frame.target - rest)[frame.observed_axes]
+    size, length = SIZES.smooth**2 * (moved**2).mean(), CORRELATION_LENGTH * np.ptp(frame.simulator.mesh.vertices[:, 0])
+    observed = np.argwhere(frame.observed_axes)
+    covariance = np.diag((1.0 + SIZES.single**2) * frame.sigma[frame.observed_axes] ** 2)
+    for i, (m, a) in enumerate(observed):
+        for j, (n, b) in enumerate(observed):
+            alike = np.exp(-((rest[m] - rest[n]) ** 2).sum() / (2.0 * length**2))
+            covariance[i, j] += size * alike * frame.axes[m, a] @ frame.axes[n, b]
+    return covariance
 
 
 def test_whitened_errors_are_independent(frame: FirstFrame, error: MeshError) -> None:
     whitening = error.whitening(SIZES)[:, error.observed]
     identity = whitening @ measured_covariance(frame) @ whitening.T
     np.testing.assert_allclose(identity, np.eye(len(identity)), atol=1e-7)
-
-
-def test_correction_is_the_prediction_of_a_gaussian_process(frame: FirstFrame, error: MeshError) -> None:
-    residual = np.random.default_rng(1).normal(0.0, 1e-4, 3 * len(frame.target))
-    vertices = frame.simulator.mesh.vertices
-    weighted = np.linalg.solve(measured_covariance(frame), residual[frame.observed_axes.ravel()])
-    expected = -(dense_covariance(frame, vertices) @ weighted).reshape(-1, 3)
-    expected[frame.simulator.fixed] = 0.0
-    np.testing.assert_allclose(error.correction(SIZES, residual), expected, atol=1e-12)
-    np.testing.assert_array_equal(error.correction(EXACT, residual), 0.0)
 
 
 def test_sizes_of_a_drawn_error_are_found(frame: FirstFrame, error: MeshError) -> None:
@@ -117,5 +97,5 @@ def test_the_depth_of_an_unlike_material_is_not_told_by_its_law(front: Specimen)
     markers = front.markers(1e-6).positions(torch.from_numpy(found.q)).numpy()
     assert deflection > 5e-3
     assert found.loading == WEIGHT.name
-    assert np.abs(markers - exact)[:, [0, 2]].max() < 5e-5
+    assert np.abs(markers - exact)[:, [0, 2]].max() < 0.01 * deflection
     assert np.abs(markers - exact)[:, 1].max() < 0.04 * deflection
