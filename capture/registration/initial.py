@@ -118,8 +118,11 @@ def _choose(first: ForceSearch, found: Estimate, error: MeshError) -> _Fit:
 
     first, found: the fit of any force and moment, of a mesh with the error that is assumed.
     """
-    weighed = [WEIGHT] if np.any(first.frame.simulator.gravity) and not first.frame.moving else []
-    fits = [_refit(first, prior, found, error) for prior in (*weighed, PULL, HELD)]
+    fits = [_refit(first, prior, found, error) for prior in (PULL, HELD)]
+    if np.any(first.frame.simulator.gravity) and not first.frame.moving:
+        hung = _refit(first, WEIGHT, found, error)
+        if _pull(first.frame, hung.found) > 0.0:  # a weight does not pull upwards
+            fits.append(hung)
     best = max(fits, key=lambda fit: fit.evidence)
     if (best.sizes.values <= ASSUMED.values).all():
         return best
@@ -143,10 +146,14 @@ def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate, error: MeshEr
 
 def _search(first: ForceSearch, prior: ForcePrior, whitening: Array, found: Estimate) -> ForceSearch:
     """The search for the same unknowns under another prior; a weight that hangs is about the one found."""
-    weight, gravity = 0.0, np.asarray(first.frame.simulator.gravity)
-    if prior.hanging:
-        weight = max(abs(float(found.force.sum(axis=0) @ gravity)) / float(np.linalg.norm(gravity)), LEAST_WEIGHT)
+    weight = max(_pull(first.frame, found), LEAST_WEIGHT) if prior.hanging else 0.0
     return ForceSearch(first.frame, prior, whitening, first.with_pose, first.with_modulus, weight)
+
+
+def _pull(frame: FirstFrame, found: Estimate) -> float:
+    """The virtual forces along gravity [N]."""
+    gravity = np.asarray(frame.simulator.gravity)
+    return float(found.force.sum(axis=0) @ gravity / np.linalg.norm(gravity))
 
 
 @dataclass(frozen=True)

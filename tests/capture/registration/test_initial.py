@@ -6,7 +6,7 @@ import torch
 from support import ROOT
 
 from rafl.capture.registration.first_frame import FirstFrame
-from rafl.capture.registration.initial import fit_first_frame
+from rafl.capture.registration.initial import WEIGHT, fit_first_frame
 from rafl.capture.registration.sequence import fit_by_sequence
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 from rafl.data.synthetic import load_force, loaded_equilibria, twisted_shapes
@@ -30,6 +30,18 @@ def test_the_true_state_is_found_from_exact_markers(
     assert found.residual < 2e-5
     assert np.linalg.norm(found.q - truth, axis=1).max() < 1e-4
     np.testing.assert_allclose(found.force.sum(0), force, atol=0.01)
+
+
+@pytest.mark.parametrize(("pull", "hangs"), [(-0.4, True), (0.4, False)])
+def test_a_weight_pulls_downwards(small_specimen: Specimen, pull: float, hangs: bool) -> None:
+    """What pushes the tip upwards is no weight, though it acts along gravity."""
+    simulator, markers = small_specimen.simulator(0.01), small_specimen.markers(1e-6)
+    force = simulator.weight.copy()
+    force[small_specimen.loaded, 2] += pull / len(small_specimen.loaded)
+    target = markers.positions(torch.from_numpy(simulator.equilibrium(force[None])[0])).numpy()
+    frame = FirstFrame(simulator, markers, small_specimen.loaded, target, np.full_like(target, 1e-5), "test")
+    assert (fit_first_frame(frame).loading == WEIGHT.name) == hangs
+    assert fit_first_frame(replace(frame, moving=True)).loading != WEIGHT.name
 
 
 def test_missing_markers_and_unobserved_axes_are_ignored(small_specimen: Specimen) -> None:
