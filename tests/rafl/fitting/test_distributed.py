@@ -165,7 +165,7 @@ def test_interruption_ends_all_processes(folder: Path) -> None:
             os.kill(process.pid or 0, signal.SIGINT)
 
     first, second = run_together(
-        2, folder, "rafl-fit", "a.h5", "--method", "sysid-branches", "--frames", 8, "--out", run, during=interrupt
+        2, folder, "rafl-fit", "a.h5", "--method", "sysid-branches", "--out", run, during=interrupt
     )
     assert (first.returncode, second.returncode) == (130, 130)
     assert error_lines(first.stderr)[-1] == "interrupted; no incomplete file was left"
