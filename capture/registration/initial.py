@@ -19,7 +19,7 @@ WEIGHT = ForcePrior("hanging weight", 1e-5, hanging=True)
 PULL, HELD = ForcePrior("force and moment", 1e-5), ForcePrior("held end", 10.0, shape_sigma=1e-5)
 LOCAL = tuple(ForcePrior("local forces", sigma) for sigma in (5e-3, 5e-2, 0.5))
 SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act on the whole surface
-LEAST_WEIGHT = 1e-3  # [N]
+LEAST_WEIGHT = 1e-3  # taken for the weight where what is found is less, or pulls upwards [N]
 REFITS = 5  # at most, with the error of the mesh that the last fit makes most probable
 SETTLED = 1.2  # ratio of standard deviations of the markers in successive fits; a smaller one ends the refits
 FORCE_CHANGE = LOCAL[0]  # prior of the forces whose change gives the velocity of a body in motion
