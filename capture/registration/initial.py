@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import FirstFrame
@@ -36,8 +37,8 @@ class InitialState:
         residual: root mean square distance between the markers and those of the mesh in equilibrium, over the observed
             axes [m].
         pose: from the frame of the target to the specimen frame; the identity if it was not fitted.
-        marker_sigma: largest standard deviation of each marker's position in any direction [m], (M); NaN where the
-            marker was not measured, and in fits with a pose.
+        marker_sigma: largest standard deviation of each marker's position in any direction [m], (M), whatever loads the
+            body; NaN where the marker was not measured, and in fits with a pose.
         loading: what loads the body, in words.
     """
 
@@ -59,6 +60,7 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     The mesh only approximates the specimen (`MeshError`); the sizes of its error are those that the fit makes most
     probable. If forces act on the free end, several priors are tried, and the one is kept under which the observation
     is most probable. Forces that dent the mesh are tried only where the mesh's error would be larger than is assumed.
+    The markers' standard deviations are those of the mixture of all fits, each as probable as the observation under it.
 
     Args:
         frame: observation.
@@ -69,10 +71,11 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     """
     start, marker_sigma = pose or IDENTITY, np.full(len(frame.target), np.nan)
     error = MeshError.of(frame, start.apply(frame.target[frame.measured]))
-    fit = _fit_surface(frame, error, pose) if frame.whole_surface else _fit_tip(frame, error, pose)
-    search, found = fit.search, fit.found
+    fits = [_fit_surface(frame, error, pose)] if frame.whole_surface else _fit_tip(frame, error, pose)
+    best = max(fits, key=lambda fit: fit.evidence)
+    search, found = best.search, best.found
     if not frame.whole_surface and pose is None:
-        marker_sigma[frame.measured] = np.hypot(search.marker_sigma(found), error.mesh_sigma(fit.sizes))
+        marker_sigma[frame.measured] = _mixed_sigma(fits, best, error)
     weight = frame.simulator.weight
     # With the assumed modulus, the same shape needs forces that are larger by the ratio of the moduli.
     force = np.exp(-found.log_modulus) * (weight + found.force) - weight
@@ -103,31 +106,35 @@ def _fit_surface(frame: FirstFrame, error: MeshError, pose: RigidTransform | Non
     return _Fit(search, found, EXACT, 0.0)
 
 
-def _fit_tip(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -> _Fit:
-    """The most probable fit of forces on the free end.
+def _fit_tip(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -> list[_Fit]:
+    """The fits of forces on the free end, by what may load it.
 
     The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose would:
     the two can hardly be told apart.
     """
     first = ForceSearch(frame, PULL, error.whitening(ASSUMED), pose is not None, pose is None)
-    return _choose(first, first.minimise(np.zeros_like(frame.simulator.mesh.vertices), pose or IDENTITY, None), error)
-
-
-def _choose(first: ForceSearch, found: Estimate, error: MeshError) -> _Fit:
-    """The most probable fit.
-
-    first, found: the fit of any force and moment, of a mesh with the error that is assumed.
-    """
+    found = first.minimise(np.zeros_like(frame.simulator.mesh.vertices), pose or IDENTITY, None)
     fits = [_refit(first, prior, found, error) for prior in (PULL, HELD)]
-    if np.any(first.frame.simulator.gravity) and not first.frame.moving:
+    if np.any(frame.simulator.gravity) and not frame.moving:
         hung = _refit(first, WEIGHT, found, error)
-        if _pull(first.frame, hung.found) > 0.0:  # a weight does not pull upwards
+        if _pull(frame, hung.found) > 0.0:  # a weight does not pull upwards
             fits.append(hung)
     best = max(fits, key=lambda fit: fit.evidence)
-    if (best.sizes.values <= ASSUMED.values).all():
-        return best
-    fits += [_refit(first, prior, found, error) for prior in LOCAL]
-    return max(fits, key=lambda fit: fit.evidence)
+    if (best.sizes.values > ASSUMED.values).any():
+        fits += [_refit(first, prior, found, error) for prior in LOCAL]
+    return fits
+
+
+def _mixed_sigma(fits: list[_Fit], best: _Fit, error: MeshError) -> Array:
+    """Standard deviations of the measured markers about those of the best fit [m], (M'), over all fits."""
+    probability = np.exp([fit.evidence - best.evidence for fit in fits])
+    markers, measured = best.search.frame.markers, best.search.frame.measured
+    positions = markers.positions(torch.from_numpy(np.stack([fit.found.q for fit in fits]))).numpy()[:, measured]
+    middle = markers.positions(torch.from_numpy(best.found.q)).numpy()[measured]
+    variance = ((positions - middle) ** 2).sum(axis=-1)
+    for k, fit in enumerate(fits):
+        variance[k] += fit.search.marker_sigma(fit.found) ** 2 + error.mesh_sigma(fit.sizes) ** 2
+    return np.asarray(np.sqrt(probability @ variance / probability.sum()))
 
 
 def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate, error: MeshError) -> _Fit:

@@ -66,12 +66,17 @@ RIGS = {
 }
 
 
+def front_layout(specimen: Specimen) -> MarkerLayout:
+    """The markers of one side of a beam only, at exact places."""
+    front = specimen.layout.positions[:, 1] == 0.0
+    names = tuple(name for name, own in zip(specimen.layout.names, front, strict=True) if own)
+    return MarkerLayout(names, specimen.layout.positions[front], 0.0)
+
+
 def front_specimen() -> Specimen:
-    """The canonical beam with the markers of one side only, at exact places."""
+    """The canonical beam with the markers of one side only."""
     whole = read_specimen(SPECIMEN)
-    front = whole.layout.positions[:, 1] == 0.0
-    names = tuple(name for name, own in zip(whole.layout.names, front, strict=True) if own)
-    return replace(whole, layout=MarkerLayout(names, whole.layout.positions[front], 0.0))
+    return replace(whole, layout=front_layout(whole))
 
 
 def held_twist(simulator: Simulator, specimen: Specimen, angles: np.ndarray) -> np.ndarray:

@@ -64,6 +64,16 @@ def test_one_camera_leaves_the_depth_uncertain_and_two_do_not(front: Specimen) -
     assert (both[seen] > 2e-7).all()
 
 
+def test_a_load_that_is_hardly_less_probable_counts(front: Specimen) -> None:
+    """A pull of eight degrees off gravity is taken for a hanging weight; any force is only 1.3 nats less probable.
+
+    Under the weight alone the error along the line of sight, 0.4 mm, is three times its sigma.
+    """
+    error, seen, sigma = fit_noisy(front, {"left": side_camera(0.0)}, 0, 0.1)
+    assert np.abs(error[seen, 2]).max() > 3e-4
+    assert (np.abs(error[seen, 2]) < 2.0 * sigma[seen]).all()
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("lateral", "least", "most"), [(0.0, 0.3, 1.0), (0.1, 1.0 / 1.5, 1.5)])
 def test_errors_along_the_line_of_sight_agree_with_their_sigma(
