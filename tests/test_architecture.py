@@ -1,8 +1,10 @@
-"""Imports run one way, folders stay small, and the tests mirror the packages."""
+"""Imports run one way, folders stay small, tests mirror the packages, and one module writes files."""
 
 import ast
+import re
 from functools import cache
 from pathlib import Path
+from typing import TypeGuard
 
 import pytest
 from support import ROOT
@@ -144,3 +146,34 @@ def test_every_subpackage_is_installed() -> None:
     for module, path in modules().items():
         if path.name == "__init__.py":
             assert f'"{module}",' in text, module
+
+
+# Modules that write other than through a temporary file that is renamed: the one that does this, the one that makes an
+# HDF5 file in memory, the log of running jobs, and the generator of this package's own source.
+WRITERS = {"rafl.common.files", "rafl.common.hdf5_files", "rafl.batch.state", "rafl.fem.laws.generated.__main__"}
+WRITING_METHODS = {"write_text", "write_bytes", "tofile", "imwrite"}
+WRITING_MODE = re.compile(r"[wax][bt+]*|r[bt]*\+[bt]*")
+
+
+def writes(path: Path) -> list[str]:
+    """Calls of a file that write to a path themselves. `av.open` writes films to memory."""
+    found = []
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Call):
+            function = node.func
+            called = function.attr if isinstance(function, ast.Attribute) else ""
+            opened = ast.unparse(function).endswith(("open", "File")) and ast.unparse(function) != "av.open"
+            strings = [part.value for part in (*node.args, *(key.value for key in node.keywords)) if is_string(part)]
+            if called in WRITING_METHODS or (opened and any(map(WRITING_MODE.fullmatch, strings))):
+                found.append(f"{path.name}:{node.lineno}")
+    return found
+
+
+def is_string(node: ast.AST) -> TypeGuard[ast.Constant]:
+    return isinstance(node, ast.Constant) and isinstance(node.value, str)
+
+
+def test_files_are_written_whole() -> None:
+    """Everything goes through `rafl.common.files`, so that a killed program leaves no half of a file."""
+    assert {module for module, path in modules().items() if writes(path)} <= WRITERS
+    assert writes(modules()["rafl.common.files"])
