@@ -1,13 +1,13 @@
 """The search for the virtual forces of a first frame, under one prior of how the body is loaded."""
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rafl.capture.registration.first_frame import FirstFrame, rigid_modes
+from rafl.capture.registration.first_frame import RESULTANT_SIGMA, FirstFrame, rigid_modes
 from rafl.capture.registration.rigid import RigidTransform, kabsch
 from rafl.common.errors import SimulationError
 from rafl.data.views import pose_jacobian
@@ -15,6 +15,7 @@ from rafl.data.views import pose_jacobian
 Array = NDArray[Any]
 
 MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
+LEAST_PULL = 1e-3  # taken for a weight where what is found is less or pulls upwards; what no load may exert [N]
 INITIAL_DAMPING = 1e4  # of a Levenberg-Marquardt step, as a multiple of the prior
 MAX_ITERATIONS, MAX_TRIALS = 100, 6  # of one search, and of one step; the sixth is damped 2^15 times as much
 # The search ends where an undamped step promises a smaller decrease: relative to the objective, plus absolute.
@@ -31,23 +32,31 @@ class ForcePrior:
             [N].
         shape_sigma: standard deviation of the loaded nodes from a rigid motion of them all [m]; infinite if they may
             deform.
-        hanging: whether the force is that of a weight, which pulls along gravity (`FirstFrame.hanging_precision`).
+        load: `weight` pulls along gravity (`FirstFrame.hanging_precision`), `none` leaves the body to its own weight.
     """
 
     name: str
     local_sigma: float
     shape_sigma: float = np.inf
-    hanging: bool = False
+    load: Literal["any", "weight", "none"] = "any"
 
-    def precision(self, frame: FirstFrame, weight: float = 0.0) -> Array:
+    def precision(self, frame: FirstFrame, pull: float) -> Array:
         """Inverse prior covariance of the forces on the frame's nodes [1/N^2], (3 L, 3 L).
 
-        weight: of what hangs on the nodes [N], about; needed if it hangs.
+        pull: of what hangs on the nodes [N], about; of no account for other loads.
         """
-        modes, sigma = frame.resultant_modes()
-        inverse = frame.hanging_precision(weight) if self.hanging else np.diag(sigma**-2.0)
+        modes, _ = frame.resultant_modes()
         local = (np.eye(len(modes)) - modes @ modes.T) / self.local_sigma**2
-        return np.asarray(modes @ inverse @ modes.T + local)
+        return np.asarray(modes @ self.resultant_precision(frame, pull) @ modes.T + local)
+
+    def resultant_precision(self, frame: FirstFrame, pull: float) -> Array:
+        """That of the amplitudes of `FirstFrame.resultant_modes` [1/N^2], (n, n)."""
+        _, sigma = frame.resultant_modes()
+        if self.load == "any":
+            return np.diag(sigma**-2.0)
+        if self.load == "weight":
+            return frame.hanging_precision(max(pull, LEAST_PULL))
+        return np.diag((sigma * LEAST_PULL / RESULTANT_SIGMA) ** -2.0)
 
 
 @dataclass(frozen=True)
@@ -85,7 +94,7 @@ class ForceSearch:
             that no camera observed is an assumption, and the same one for all markers: it has no part in them.
         with_pose: whether the pose is fitted too.
         with_modulus: whether Young's modulus is fitted too, around the assumed one.
-        weight: of what hangs on the nodes [N], about, for the prior of a hanging weight.
+        pull: of what hangs on the nodes [N], about, for the prior of a hanging weight.
     """
 
     def __init__(
@@ -95,11 +104,11 @@ class ForceSearch:
         whitening: Array,
         with_pose: bool,
         with_modulus: bool,
-        weight: float = 0.0,
+        pull: float,
     ) -> None:
         self.frame, self.prior, self.with_pose, self.with_modulus = frame, prior, with_pose, with_modulus
         self.whitening = whitening
-        self.precision = prior.precision(frame, weight)
+        self.precision = prior.precision(frame, pull)
         self.expected = frame.expected_force()
 
     def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float) -> Estimate:

@@ -14,13 +14,13 @@ from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 
 Array = NDArray[Any]
 
-# What may load the free end: a weight that hangs from it; any force and moment, and practically nothing else; a hand
-# that holds it, so that it hardly deforms (by 10 um, as little as a first frame tells); local forces, which dent it.
-WEIGHT = ForcePrior("hanging weight", 1e-5, hanging=True)
+# What may load the free end: nothing; a weight that hangs from it; any force and moment, and practically nothing else;
+# a hand that holds it, so that it hardly deforms (by 10 um, as little as a first frame tells); local forces, which dent
+# it. At rest without a force upwards, the first two are possible.
+UNLOADED, WEIGHT = ForcePrior("no load", 1e-5, load="none"), ForcePrior("hanging weight", 1e-5, load="weight")
 PULL, HELD = ForcePrior("force and moment", 1e-5), ForcePrior("held end", 10.0, shape_sigma=1e-5)
 LOCAL = tuple(ForcePrior("local forces", sigma) for sigma in (5e-3, 5e-2, 0.5))
 SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act on the whole surface
-LEAST_WEIGHT = 1e-3  # taken for the weight where what is found is less, or pulls upwards [N]
 REFITS = 5  # at most, with the error of the mesh that the last fit makes most probable
 SETTLED = 1.2  # ratio of standard deviations of the markers in successive fits; a smaller one ends the refits
 FORCE_CHANGE = LOCAL[0]  # prior of the forces whose change gives the velocity of a body in motion
@@ -101,7 +101,7 @@ class _Fit:
 
 def _fit_surface(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -> _Fit:
     """The fit of forces on the whole surface, which leave no error of the mesh."""
-    search = ForceSearch(frame, SURFACE_PRIOR, error.whitening(EXACT), pose is not None, False)
+    search = ForceSearch(frame, SURFACE_PRIOR, error.whitening(EXACT), pose is not None, False, 0.0)
     found = search.minimise(np.zeros_like(frame.simulator.mesh.vertices), pose or IDENTITY, None)
     return _Fit(search, found, EXACT, 0.0)
 
@@ -112,12 +112,13 @@ def _fit_tip(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -
     The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose would:
     the two can hardly be told apart.
     """
-    first = ForceSearch(frame, PULL, error.whitening(ASSUMED), pose is not None, pose is None)
+    first = ForceSearch(frame, PULL, error.whitening(ASSUMED), pose is not None, pose is None, 0.0)
     found = first.minimise(np.zeros_like(frame.simulator.mesh.vertices), pose or IDENTITY, None)
     fits = [_refit(first, prior, found, error) for prior in (PULL, HELD)]
     if np.any(frame.simulator.gravity) and not frame.moving:
+        fits.append(_refit(first, UNLOADED, found, error))
         hung = _refit(first, WEIGHT, found, error)
-        if _pull(frame, hung.found) > 0.0:  # a weight does not pull upwards
+        if _pull(frame, hung.found.force) > 0.0:  # a weight does not pull upwards
             fits.append(hung)
     best = max(fits, key=lambda fit: fit.evidence)
     if (best.sizes.values > ASSUMED.values).any():
@@ -153,14 +154,14 @@ def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate, error: MeshEr
 
 def _search(first: ForceSearch, prior: ForcePrior, whitening: Array, found: Estimate) -> ForceSearch:
     """The search for the same unknowns under another prior; a weight that hangs is about the one found."""
-    weight = max(_pull(first.frame, found), LEAST_WEIGHT) if prior.hanging else 0.0
-    return ForceSearch(first.frame, prior, whitening, first.with_pose, first.with_modulus, weight)
+    pull = _pull(first.frame, found.force)
+    return ForceSearch(first.frame, prior, whitening, first.with_pose, first.with_modulus, pull)
 
 
-def _pull(frame: FirstFrame, found: Estimate) -> float:
-    """The virtual forces along gravity [N]."""
+def _pull(frame: FirstFrame, force: Array) -> float:
+    """The sum of forces (N, 3) along gravity [N]; zero without gravity."""
     gravity = np.asarray(frame.simulator.gravity)
-    return float(found.force.sum(axis=0) @ gravity / np.linalg.norm(gravity))
+    return float(force.sum(axis=0) @ gravity / max(np.linalg.norm(gravity), np.finfo(float).tiny))
 
 
 @dataclass(frozen=True)
@@ -172,31 +173,66 @@ class ResultantFit:
         q: node positions [m], (N, 3).
         residual: markers of the mesh minus measured markers along their axes [m], (3 M').
         whitening: of the residuals in the objective [1/m], (K, 3 M').
+        jacobian: derivatives of the whitened residuals by the amplitudes of the n modes [1/N], (K, n).
+        amplitude: of the modes, less their expected values [N], (n).
+        prior: of the force and the moment.
     """
 
     force: Array
     q: Array
     residual: Array
     whitening: Array
+    jacobian: Array
+    amplitude: Array
+    prior: ForcePrior
+
+    def most_probable_prior(self, frame: FirstFrame, shared: Array) -> ForcePrior:
+        """A hanging weight or any force, whichever is more probable near this fit.
+
+        shared: whitened derivatives of the residuals by numbers of mean zero and variance one that all first frames
+            have in common, (K, S).
+        """
+        pull = _pull(frame, self.force)
+        if pull <= 0.0:
+            return PULL
+        residual = self.whitening @ self.residual - self.jacobian @ self.amplitude
+        known = np.eye(len(residual)) + shared @ shared.T
+
+        def log_evidence(prior: ForcePrior) -> float:
+            by_force = self.jacobian @ np.linalg.solve(prior.resultant_precision(frame, pull), self.jacobian.T)
+            covariance = known + by_force
+            spread = np.linalg.slogdet(covariance)[1]
+            return float(-0.5 * (residual @ np.linalg.solve(covariance, residual) + spread))
+
+        return max((PULL, WEIGHT), key=log_evidence)
 
 
-def fit_resultant(frame: FirstFrame, model_sigma: float, start: ResultantFit | None = None) -> ResultantFit:
+def fit_resultant(
+    frame: FirstFrame, model_sigma: float, start: ResultantFit | None = None, prior: ForcePrior = PULL
+) -> ResultantFit:
     """Fit a force and a moment, from an earlier fit.
 
-    model_sigma: standard deviation of the difference between mesh and specimen [m].
+    Args:
+        frame: observation.
+        model_sigma: standard deviation of the difference between mesh and specimen [m].
+        start: earlier fit.
+        prior: of the force and the moment; a weight that hangs is about the one of the earlier fit.
 
     Raises:
         SimulationError: an equilibrium could not be found.
     """
     sigma = np.hypot(frame.sigma[frame.measured], model_sigma)
     weight = np.where(frame.observed_axes, 1.0 / sigma, 0.0).ravel()
-    search = ForceSearch(frame, PULL, np.diag(weight), False, False)
     force = np.zeros_like(frame.simulator.mesh.vertices)
     force[frame.nodes] = frame.expected_force().reshape(-1, 3)
     if start is not None:
         force = start.force
+    search = ForceSearch(frame, prior, np.diag(weight), False, False, _pull(frame, force))
     found = search.minimise(force, IDENTITY, start.q if start else None)
-    return ResultantFit(found.force, found.q, found.residual, search.whitening)
+    modes, _ = frame.resultant_modes()
+    jacobian = search.whitening @ marker_jacobian(frame, found.q) @ modes
+    amplitude = modes.T @ (found.force[frame.nodes].ravel() - frame.expected_force())
+    return ResultantFit(found.force, found.q, found.residual, search.whitening, jacobian, amplitude, prior)
 
 
 def resultant_jacobian(frame: FirstFrame, fit: ResultantFit) -> tuple[Array, Array]:
@@ -205,12 +241,9 @@ def resultant_jacobian(frame: FirstFrame, fit: ResultantFit) -> tuple[Array, Arr
     Returns:
         The derivatives by the amplitudes of the n modes, (3 M' + n, n), and the residuals.
     """
-    modes, sigma = frame.resultant_modes()
-    prior = 1.0 / sigma
-    amplitude = modes.T @ (fit.force[frame.nodes].ravel() - frame.expected_force())
-    jacobian = fit.whitening @ marker_jacobian(frame, fit.q) @ modes
-    residual = np.concatenate([fit.whitening @ fit.residual, prior * amplitude])
-    return np.concatenate([jacobian, np.diag(prior)]), residual
+    root = np.linalg.cholesky(fit.prior.resultant_precision(frame, _pull(frame, fit.force))).T
+    residual = np.concatenate([fit.whitening @ fit.residual, root @ fit.amplitude])
+    return np.concatenate([fit.jacobian, root]), residual
 
 
 def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> Array:
@@ -230,7 +263,7 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
     weight = 1.0 / sigma[known]
     weighted = weight[:, None] * jacobian[known]
     own = SURFACE_PRIOR if frame.whole_surface else FORCE_CHANGE
-    prior = own.precision(frame) / FORCE_CHANGE_RATE**2
+    prior = own.precision(frame, 0.0) / FORCE_CHANGE_RATE**2
     gradient = weighted.T @ (weight * velocity[known])
     force_rate = np.zeros_like(q)
     force_rate[frame.nodes] = np.linalg.solve(weighted.T @ weighted + prior, gradient).reshape(-1, 3)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
 from rafl.capture.registration.force_search import MODULUS_SIGMA, modulus_slope
-from rafl.capture.registration.initial import ResultantFit, fit_resultant, resultant_jacobian
+from rafl.capture.registration.initial import PULL, ResultantFit, fit_resultant, resultant_jacobian
 from rafl.capture.registration.rigid import RigidTransform
 from rafl.data.markers import Markers, embed
 from rafl.data.views import pose_jacobian
@@ -55,8 +55,9 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
         sum |x - target|^2 / (sigma^2 + R model_sigma^2) + sum |moved|^2 / prior_sigma^2 + the forces' prior + E's prior
 
     with R recordings, and a model_sigma of each that follows from its deflection (`MODEL_FRACTION`). The forces are
-    eliminated recording by recording. A pose and an unknown force can hardly be told apart, nor then can E; known loads
-    decide (`FirstFrame.load`).
+    eliminated recording by recording, as those of a hanging weight where this is more probable: with one camera,
+    sideways forces that nobody exerted would move the places. A pose and an unknown force can hardly be told apart, nor
+    then can E; known loads decide (`FirstFrame.load`).
 
     Args:
         frames: observations, with the markers embedded at their places in the layout.
@@ -71,6 +72,7 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
     count, log_modulus, markers = len(layout.names), 0.0, layout
     moved = np.zeros((count, 3))
     fits: list[ResultantFit | None] = [None] * len(frames)
+    priors = [PULL] * len(frames)
     longest = float(np.ptp(layout.rest, axis=0).max())
     model_sigma = [MODEL_FRACTION * longest] * len(frames)  # until the deflections are known
     by_place = np.repeat(np.maximum(prior_sigma, MIN_PRIOR_SIGMA) ** -2.0, 3)
@@ -80,17 +82,20 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
     for _ in range(MAX_ITERATIONS):
         modulus = simulator.material.youngs_modulus * np.exp(log_modulus)
         softened = simulator.with_material(replace(simulator.material, youngs_modulus=modulus))
-        hessian = np.diag(precision)
+        hessian, chosen = np.diag(precision), []
         gradient = precision * np.concatenate([[log_modulus], np.zeros(6), moved.ravel()])
         for k, frame in enumerate(frames):
             current = replace(frame, simulator=softened, markers=markers)
             if unknown[k]:
                 current = replace(current, target=pose.apply(frame.target))
-            fit = fit_resultant(current, model_sigma[k], fits[k])
+            fit = fit_resultant(current, model_sigma[k], fits[k], priors[k])
             fits[k] = fit
-            own_hessian, own_gradient = _reduced_normal_equations(current, fit, unknown[k])
+            shared = _shared_slopes(current, fit, unknown[k])
+            own_hessian, own_gradient = _reduced_normal_equations(current, fit, shared)
             hessian += own_hessian
             gradient += own_gradient
+            by_unit = shared[:, precision > 0.0] / np.sqrt(precision[precision > 0.0])
+            chosen.append(PULL if unknown[k] else fit.most_probable_prior(current, by_unit))
             deflection = markers.positions(torch.from_numpy(fit.q)).numpy() - markers.rest
             size = float(np.sqrt(np.mean((deflection**2).sum(-1))))
             model_sigma[k] = float(np.sqrt(len(frames))) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
@@ -104,8 +109,9 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
         tolerance = np.concatenate(
             [[MODULUS_TOLERANCE], np.full(6, POSE_TOLERANCE), np.full(3 * count, STEP_TOLERANCE)]
         )
-        if (np.abs(step) < tolerance).all():
+        if (np.abs(step) < tolerance).all() and chosen == priors:
             break
+        priors = chosen
     sigma = np.sqrt(np.diag(covariance))
     markers = replace(markers, moved=moved, place_sigma=sigma[7:].reshape(-1, 3))
     modulus = simulator.material.youngs_modulus * np.exp(log_modulus)
@@ -118,9 +124,8 @@ def _inverse(hessian: Array) -> Array:
     return np.asarray(scale[:, None] * np.linalg.inv(scale[:, None] * hessian * scale) * scale)
 
 
-def _reduced_normal_equations(frame: FirstFrame, fit: ResultantFit, posed: bool) -> tuple[Array, Array]:
-    """Half the Hessian and half the gradient of one recording's part by (log E, pose, places), less its forces."""
-    local, residual = resultant_jacobian(frame, fit)
+def _shared_slopes(frame: FirstFrame, fit: ResultantFit, posed: bool) -> Array:
+    """Derivatives of a recording's whitened residuals by (log E, pose, places), (K, 7 + 3 M)."""
     rows = np.flatnonzero(np.repeat(frame.measured, 3))
     whole = np.zeros((3 * len(frame.target), 7 + 3 * len(frame.target)))
     q = torch.from_numpy(fit.q)
@@ -130,9 +135,18 @@ def _reduced_normal_equations(frame: FirstFrame, fit: ResultantFit, posed: bool)
     if posed:
         whole[:, 1:7] = -pose_jacobian(frame.target).reshape(-1, 6)
     whole[rows, 0] = modulus_slope(frame, fit.q, fit.force).ravel()
-    shared = np.zeros((len(residual), whole.shape[1]))
     by_axis = frame.along_axes(whole[rows].reshape(-1, 3, whole.shape[1])).reshape(len(rows), -1)
-    shared[: len(fit.whitening)] = fit.whitening @ by_axis
+    return np.asarray(fit.whitening @ by_axis)
+
+
+def _reduced_normal_equations(frame: FirstFrame, fit: ResultantFit, slopes: Array) -> tuple[Array, Array]:
+    """Half the Hessian and half the gradient of one recording's part by (log E, pose, places), less its forces.
+
+    slopes: `_shared_slopes` of the recording.
+    """
+    local, residual = resultant_jacobian(frame, fit)
+    shared = np.zeros((len(residual), slopes.shape[1]))
+    shared[: len(slopes)] = slopes
     # What the forces can explain is taken out.
     basis = np.linalg.qr(local)[0]
     shared -= basis @ (basis.T @ shared)
