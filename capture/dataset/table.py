@@ -47,7 +47,9 @@ def read_recording_rows(path: Path) -> list[RecordingRow]:
         raise InputError(f"expected a table in {path}, found: {error}; save it as CSV UTF-8") from None
     if not table.fieldnames:
         raise InputError(f"expected a table in {path}, found an empty file; save it as CSV UTF-8")
-    rows = []
+    columns = [name.strip() for name in table.fieldnames]
+    _check_columns(columns, path)
+    rows, loads = [], []
     for line, record in records:
         if any(record.pop(None, [])):
             raise InputError(
@@ -59,12 +61,37 @@ def read_recording_rows(path: Path) -> list[RecordingRow]:
         if not given:  # an empty row of a spreadsheet
             continue
         if separator != "," and "load_g" in given:
+            loads.append(given["load_g"])
             given["load_g"] = given["load_g"].replace(",", ".")
         try:
             rows.append(RecordingRow.model_validate(given))
         except pydantic.ValidationError as error:
             raise InputError(f"{path} line {line}, column {describe_validation(error)}; correct it") from None
+    _check_decimal_sign(loads, path)
     if not rows:
         raise InputError(f"expected at least one recording in {path}, found none; add a row")
     require_names((row.recording for row in rows), f"{path}, column recording")
     return rows
+
+
+def _check_columns(columns: list[str], path: Path) -> None:
+    """Raise InputError unless the columns of a row are there, each once."""
+    found = ", ".join(column or "one without a name" for column in columns)
+    for column in columns:
+        if columns.count(column) > 1 and column:
+            raise InputError(f"{path}: expected every column once, found {column} twice; remove one")
+    required = [name for name, field in RecordingRow.model_fields.items() if field.is_required()]
+    if not set(required) <= set(columns):
+        raise InputError(
+            f"{path}: expected the columns {', '.join(required)} in the first line, found {found}; correct that line"
+        )
+
+
+def _check_decimal_sign(loads: list[str], path: Path) -> None:
+    """Raise InputError if a point may separate thousands, where commas separate decimals."""
+    comma, point = (next((load for load in loads if sign in load), None) for sign in ",.")
+    if comma and point:
+        raise InputError(
+            f"{path}, column load_g: expected one decimal sign, found {comma} and {point}; write all loads alike, "
+            "without a sign between thousands"
+        )

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import torch
@@ -109,6 +109,14 @@ class Body(StrictModel):
     clamp: _Clamp
     load: _Load = _Load(face="x-max")
     simulation: _Simulation = _Simulation()
+
+    @model_validator(mode="after")
+    def _load_is_not_on_the_clamp(self) -> Self:
+        if self.load.face == self.clamp.face:
+            raise ValueError(
+                f"expected the load on another face than the clamp, found both on {self.clamp.face}; correct load"
+            )
+        return self
 
     def with_material(self, **values: float) -> "Body":
         """The body with other values of its material (Young's modulus [Pa], density [kg/m^3]), to four digits."""

@@ -10,6 +10,7 @@ if TYPE_CHECKING:  # the import takes a second, which commands that refuse their
     import pandas as pd
 
 SEPARATORS = ",;\t"
+WORKBOOK_START = b"PK\x03\x04"  # of .xlsx and .ods files
 FORMULA_STARTS = ("=", "+", "-", "@")
 
 
@@ -22,6 +23,9 @@ def read_table_text(path: Path) -> tuple[str, str, int]:
     Raises:
         InputError: the file is not text.
     """
+    with path.open("rb") as file:
+        if file.read(len(WORKBOOK_START)) == WORKBOOK_START:
+            raise InputError(f"expected a table in {path}, found an Excel workbook; save it as CSV UTF-8")
     try:
         text = path.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError as error:

@@ -14,6 +14,7 @@ from rafl.common.yaml_files import StrictModel, read_yaml
 
 SPECIMEN_FORMAT = "rafl-specimen/1"
 MAX_GRID_LINES = 100  # rows, and columns, of a grid
+PLACE_DIGITS = 3  # of at_mm; places that agree in them are one
 DEFAULT_SIGMA_MM = 0.5  # standard deviation of a dot that a hand places with a ruler or a stencil
 
 
@@ -63,9 +64,19 @@ class MarkerGrid(StrictModel):
         return entries
 
 
-def _check_unique_names(markers: list[MarkerEntry | MarkerGrid]) -> list[MarkerEntry | MarkerGrid]:
-    check_distinct(marker.name for item in markers for marker in item.markers())
-    return markers
+def _check_distinct(items: list[MarkerEntry | MarkerGrid]) -> list[MarkerEntry | MarkerGrid]:
+    """Raise ValueError if two markers have one name or one place."""
+    markers = [marker for item in items for marker in item.markers()]
+    check_distinct(marker.name for marker in markers)
+    names: dict[tuple[float, ...], str] = {}
+    for marker in markers:
+        place = tuple(round(value, PLACE_DIGITS) + 0.0 for value in marker.at_mm)
+        if place in names:
+            raise ValueError(
+                f"expected markers at different places, found {names[place]} and {marker.name} both at {list(place)} mm"
+            )
+        names[place] = marker.name
+    return items
 
 
 def _kind(value: object) -> str:
@@ -73,7 +84,7 @@ def _kind(value: object) -> str:
 
 
 _Item = Annotated[Annotated[MarkerEntry, Tag("<marker>")] | Annotated[MarkerGrid, Tag("<grid>")], Discriminator(_kind)]
-MarkerList = Annotated[list[_Item], AfterValidator(_check_unique_names)]
+MarkerList = Annotated[list[_Item], AfterValidator(_check_distinct)]
 
 
 class _Body(BaseModel):

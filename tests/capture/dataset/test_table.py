@@ -13,7 +13,10 @@ from rafl.common.errors import InputError
     [
         ("recording,load_g,split\na,50,training\n", "line 2, column split"),
         ("recording,load_g,split\na,50,train\nb,heavy,test\n", "line 3, column load_g"),
-        ("recording,load,split\na,50,train\n", "line 2"),
+        ("recording,load,split\na,50,train\n", "expected the columns recording, load_g, split"),
+        ("recording,load_g,load_g,split\na,60,70,train\n", "found load_g twice"),
+        ("recording;load_g;split\na;60,5;train\nb;1.500;train\n", "found 60,5 and 1.500"),
+        ("PK\x03\x04recording,load_g,split\n", "found an Excel workbook"),
         ("recording,load_g,split\n", "at least one recording"),
         ("recording,load_g,split\n\na,50,train\n,,\nb,heavy,test\n", "line 5, column load_g"),
         ("recording,load_g,split\na,60,5,train\n", "line 2: expected 3 cells"),

@@ -40,6 +40,7 @@ def test_the_canonical_beam_matches_the_paper() -> None:
         ("mass: lumped", "viscosity: -1", "material.viscosity"),
         ("substeps: 1", "substeps: 0", "simulation.substeps"),
         ("face: x-min", "face: x-min, split: 1.0", "clamp.split"),
+        ("face: x-min", "face: x-max", "expected the load on another face than the clamp, found both on x-max"),
         ("mass: lumped", "loss: {tan_delta: 0.1, from_hz: 50, to_hz: 5}", "material.loss: .*from_hz below to_hz"),
         ("mass: lumped", "branches: [{modulus_share: 0.1, time_s: 0}]", "material.branches.0.time_s"),
         (

@@ -53,6 +53,10 @@ def test_directions_of_rows_and_columns(tmp_path: Path, face: str, second: list[
         ("{name: L, at_mm: [1, 0]}", r"markers\.1\.at_mm\.2: "),
         ("{name: L, at_mm: [1, 0, 2], at_sigma_mm: -1}", r"markers\.1\.at_sigma_mm: "),
         ("{name: L, face: y-min, at_mm: [1, 0, 2], rows: 1, columns: 2, spacing_mm: 6}", "'L1' more than once"),
+        (
+            "{name: K, face: y-min, at_mm: [0, 0, 0], rows: 1, columns: 2, spacing_mm: 6}",
+            r"found L1 and K1 both at \[0.0, 0.0, 0.0\] mm",
+        ),
     ],
 )
 def test_wrong_entries_are_named(tmp_path: Path, entry: str, message: str) -> None:
