@@ -43,7 +43,7 @@ from rafl.capture.rendering.motion import SimulatedMotion, tip_load_release, twi
 from rafl.capture.rendering.render import Appearance, Renderer
 from rafl.capture.report import dataset_page
 from rafl.capture.specimen.specimen import Body, Specimen, read_specimen
-from rafl.common.command_line import progress
+from rafl.common.command_line import next_command, progress
 from rafl.common.errors import InputError, SimulationError
 from rafl.common.files import new_content, require_writable, write_text, written_files
 from rafl.common.kernels import announce_compilation
@@ -125,7 +125,7 @@ def render(
         write_truth(out / "truth.h5", described, motions, rig, truth)
         write_text(out / "recordings.csv", _recordings_csv(motions))
     typer.echo(f"wrote {out}/ (videos/, calibration/, recordings.csv, truth.h5)")
-    typer.echo(f"next: rafl-calibrate {out}/calibration --out {out}/calib.yaml")
+    typer.echo(next_command("rafl-calibrate", out / "calibration", "--out", out / "calib.yaml"))
 
 
 def _with_distinct_names(motions: list[SimulatedMotion]) -> list[SimulatedMotion]:
@@ -206,7 +206,7 @@ def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str |
     if note := uncertain_sag(found, lying):
         typer.echo(f"note: {note} (--lying, --youngs-modulus)")
     typer.echo(f"wrote {out} and {out.with_suffix('.png')}")
-    typer.echo(f"next: rafl-track videos/ --calib calib.yaml --specimen {out}")
+    typer.echo(next_command("rafl-track", "videos/", "--calib", "calib.yaml", "--specimen", out))
 
 
 def stencil(size_mm: tuple[float, float, float], dot_mm: float, out: Path) -> None:
@@ -258,7 +258,7 @@ def capture(
     for line in dict.fromkeys([*warnings(dataset), *missing_pixels(whole)]):
         typer.echo(f"warning: {line}", err=True)
     typer.echo(f"wrote {path} and {report}")
-    typer.echo(f"next: rafl-fit {path}")
+    typer.echo(next_command("rafl-fit", path))
 
 
 def _built(

@@ -15,6 +15,7 @@ from rafl.capture import cli
 from rafl.capture.dataset.sources import find_sources
 from rafl.capture.dataset.table import read_recording_rows
 from rafl.capture.specimen.specimen import read_specimen
+from rafl.common.command_line import next_command
 
 
 def capture(given: Mapping[str, Any], how: Batch) -> None:
@@ -37,4 +38,4 @@ def capture(given: Mapping[str, Any], how: Batch) -> None:
     ended = execute([unit], path.parent / UNITS_FOLDER, how)
     if ended is not None:
         end_of(ended, path.parent / UNITS_FOLDER)
-        typer.echo(f"next: rafl-fit {path}")
+        typer.echo(next_command("rafl-fit", path))

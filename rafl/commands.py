@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import Progress, TaskID
 from rich.table import Table
 
-from rafl.common.command_line import create_table, failure, progress
+from rafl.common.command_line import create_table, failure, next_command, progress
 from rafl.common.errors import InputError, SimulationError
 from rafl.common.files import require_writable, written_files
 from rafl.common.kernels import announce_compilation
@@ -94,7 +94,7 @@ def fit(
         for line in parameter_sentences(pd.read_csv(run / "parameters.csv"), through_model):
             typer.echo(line)
     typer.echo(f"wrote {run}/ (model.pt, history.csv, config.yaml)")
-    typer.echo(f"next: rafl-eval {run} {' '.join(str(path) for path in paths)}")
+    typer.echo(next_command("rafl-eval", run, *paths))
 
 
 def _run_name(dataset: str, method: str) -> str:

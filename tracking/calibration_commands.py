@@ -19,7 +19,7 @@ from rafl.calibration.rig import BoardSource, Rig, read_board_source, write_cali
 from rafl.calibration.solve import solve_rig
 from rafl.calibration.summary import camera_table, check_table, perspective_messages
 from rafl.calibration.validation import check_view, write_residual_plot
-from rafl.common.command_line import create_table, progress
+from rafl.common.command_line import create_table, next_command, progress
 from rafl.common.errors import InputError
 from rafl.common.files import require_writable, written_files
 from rafl.common.kernels import announce_compilation
@@ -189,7 +189,10 @@ def check_calibration(calib: Path, unit: str | None, images: Path, board: Path) 
 
 def _print_next(out: Path) -> None:
     typer.echo(f"wrote {out}")
-    typer.echo(f"next: rafl-track videos/ --calib {out} (with --specimen, once there is a specimen file)")
+    beside = out.parent / "videos"
+    videos = beside if beside.is_dir() else "videos/"
+    remark = "(with --specimen, once there is a specimen file)"
+    typer.echo(next_command("rafl-track", videos, "--calib", out, remark=remark))
 
 
 def _values_by_camera(option: str, given: list[str], cameras: list[str], allowed: tuple[str, ...]) -> dict[str, str]:

@@ -19,7 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from rafl.calibration.foreign.read import read_any_calibration
 from rafl.calibration.rig import Rig
-from rafl.common.command_line import create_table, progress
+from rafl.common.command_line import create_table, next_command, progress
 from rafl.common.errors import InputError
 from rafl.common.files import require_writable
 from rafl.common.kernels import announce_compilation
@@ -197,12 +197,13 @@ def print_results(
         typer.echo(f"kept the tracks of {kept} recordings: nothing changed since they were tracked")
     typer.echo(f"wrote {len(done) - kept} tracks files to {out}/" + (f"; look at {out}/report.html" if report else ""))
     if specimen:
-        typer.echo(f"next: rafl-capture {specimen} {out} --recordings recordings.csv")
+        beside = out.parent / "recordings.csv"
+        table = beside if beside.exists() else beside.name
+        typer.echo(next_command("rafl-capture", specimen, out, "--recordings", table))
     else:
         still = min(done, key=lambda name: _extent(done[name]))
-        typer.echo(
-            f"next: rafl-specimen {out}/{still}.h5 --box LENGTHxWIDTHxHEIGHT (of the body in mm), if it is at rest"
-        )
+        remark = "(of the body in mm), if it is at rest"
+        typer.echo(next_command("rafl-specimen", out / f"{still}.h5", "--box", "LENGTHxWIDTHxHEIGHT", remark=remark))
 
 
 def _extent(tracks: Tracks) -> float:

@@ -14,7 +14,7 @@ from rafl.capture.dataset.camera_summary import change_attributes
 from rafl.capture.dataset.modulus import estimate_modulus
 from rafl.capture.dataset.naming import in_layout_order
 from rafl.capture.dataset.refine_cameras import refine_cameras, require_following_elements
-from rafl.capture.dataset.registered import Registered, find_dataset_places
+from rafl.capture.dataset.registered import Registered, check_near_clamp, find_dataset_places
 from rafl.capture.dataset.settings import CaptureSettings
 from rafl.capture.dataset.sources import find_sources, read_recording
 from rafl.capture.dataset.table import RecordingRow
@@ -93,6 +93,7 @@ def build_dataset(
         recording = recordings[row.recording]
         registration = register(recording, specimen, rest, settings.fit_tolerance, settings.moving_clamp, row.recording)
         registered.append(Registered.of(specimen, recording, row, registration, settings))
+        check_near_clamp(empty, specimen, registered[-1], settings.fit_tolerance)
     dataset = _with_recordings(empty, specimen, registered, known, settings, tick)
     found = None
     if settings.refine_cameras:

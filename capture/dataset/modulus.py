@@ -17,6 +17,7 @@ from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
+LEAST_INDEPENDENT = 1e-10  # share of a function's inertia that is its own
 INVERSE_ITERATIONS = 3  # for the first modes; the frequency of a beam then changes by less than 1e-4
 
 
@@ -139,8 +140,12 @@ def _first_modes(simulator: Simulator, q: Array, mass: Array) -> tuple[Array, Ar
             columns.T @ force.reshape(columns.shape),
             columns.T @ (weight * solved).reshape(columns.shape),
         )
-        squared, mixture = eigh(0.5 * (stiffness + stiffness.T), inertia)
-        shapes = (columns @ mixture).reshape(solved.shape)
+        # Of a mesh of few nodes some functions are alike, or nearly so.
+        size, directions = eigh(inertia / np.sqrt(np.outer(inertia.diagonal(), inertia.diagonal())))
+        independent = directions[:, size > LEAST_INDEPENDENT] / np.sqrt(size[size > LEAST_INDEPENDENT])
+        independent /= np.sqrt(inertia.diagonal())[:, None]
+        squared, mixture = eigh(independent.T @ (0.5 * (stiffness + stiffness.T)) @ independent)
+        shapes = (columns @ independent @ mixture).reshape(*solved.shape[:2], -1)
     return squared, shapes
 
 

@@ -72,8 +72,8 @@ def _check_size(recording: Recording, specimen: Specimen, name: str) -> None:
     if not 1.0 / WRONG_UNIT < found / expected < WRONG_UNIT:
         raise InputError(
             f"recording {name}: expected markers up to {2e3 * expected:.3g} mm apart as in the specimen, found "
-            f"{2e3 * found:.3g} mm; the unit of {recording.source.partition(' ')[0]} is wrong (m, cm or mm): export it "
-            "in another one"
+            f"{2e3 * found:.3g} mm; at_mm in the specimen file are not in mm, or the unit of "
+            f"{recording.source.partition(' ')[0]} is wrong (m, cm or mm): correct the one or export the other again"
         )
 
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
 from rafl.calibration.summary import OTHER_SET_UP
 from rafl.capture.dataset.settings import CaptureSettings
@@ -24,6 +25,10 @@ from rafl.data.markers import Markers
 from rafl.data.views import View
 
 Array = NDArray[Any]
+
+# A marker moves by no more than this multiple of its distance from the clamp: where a slack body that a clamp holds
+# level hangs down from it, by the root of two.
+MOST_MOTION = 1.5
 
 
 @dataclass(frozen=True)
@@ -68,8 +73,8 @@ class Registered:
         last = len(recording.time) - 1 if row.last_frame is None else row.last_frame
         if not start.frame < last < len(recording.time):
             raise InputError(
-                f"recording {row.recording}: expected frames within 0 to {len(recording.time) - 1}, found "
-                f"{start.frame} to {last}; correct recordings.csv"
+                f"recording {row.recording}: expected at least two frames within 0 to {len(recording.time) - 1}, "
+                f"found {start.frame} to {last}; correct recordings.csv"
             )
         kept = np.array(
             [k if name not in registration.outliers else -1 for k, name in enumerate(specimen.layout.names)]
@@ -208,6 +213,36 @@ def _check_places(specimen: Specimen, described: Markers, markers: Markers, sett
             f"in the first frames (root mean square; at most {1e3 * settings.fit_tolerance:g} mm). Either at_mm is "
             f"wrong, or the calibration's world is not the specimen's frame, or {OTHER_SET_UP}; --fit-tolerance-mm "
             "allows more"
+        )
+
+
+def check_near_clamp(dataset: Dataset, specimen: Specimen, item: Registered, tolerance: float) -> None:
+    """Check that the markers are where a body that is held at its clamp can have them.
+
+    Args:
+        dataset: with the markers as described.
+        specimen: its description.
+        item: the recording; not checked if its pose is still unknown.
+        tolerance: [m].
+
+    Raises:
+        InputError: in the first frame, a marker is farther from its place.
+    """
+    if item.registration.pose_from_model:
+        return
+    frame = item.first_frame(dataset, specimen, whole_surface=False)
+    rest, clamp = frame.markers.rest[frame.measured], frame.simulator.mesh.vertices[specimen.fixed]
+    along = np.where(frame.observed_axes, frame.along_axes(frame.target[frame.measured] - rest), 0.0)
+    moved, distance = np.linalg.norm(along, axis=1), cdist(rest, clamp).min(axis=1)
+    beyond = moved - MOST_MOTION * distance
+    worst = int(np.argmax(beyond))
+    if beyond[worst] > tolerance:
+        name = np.array(frame.markers.names)[frame.measured][worst]
+        raise InputError(
+            f"recording {frame.recording}, frame {item.start.frame}: expected marker {name} near its at_mm, "
+            f"{1e3 * distance[worst]:.1f} mm from the clamp, found it {1e3 * moved[worst]:.1f} mm off. Either names or "
+            "at_mm of markers are wrong, or this is another specimen, or the calibration's world is not the specimen's "
+            f"frame, or {OTHER_SET_UP}"
         )
 
 

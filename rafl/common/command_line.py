@@ -2,8 +2,10 @@
 
 import functools
 import os
+import shlex
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
 
 import typer
@@ -104,6 +106,21 @@ def one_line(text: str) -> str:
     """A text in one line of visible characters; others, as names from files may have, as escape sequences."""
     parts = (part if part.isprintable() else part.encode("unicode_escape").decode() for part in " ".join(text.split()))
     return "".join(parts)
+
+
+def next_command(name: str, *arguments: object, remark: str = "") -> str:
+    """A line that says which command comes next, with arguments quoted as a shell needs them.
+
+    Args:
+        name: of the command.
+        arguments: options, paths and other values; a path that begins like an option gets `./` before it.
+        remark: put after the command.
+    """
+    given = [
+        f"./{argument}" if isinstance(argument, Path) and str(argument).startswith("-") else str(argument)
+        for argument in arguments
+    ]
+    return f"next: {shlex.join([name, *given])}" + (f" {remark}" if remark else "")
 
 
 def create_app(help_text: str) -> typer.Typer:

@@ -238,6 +238,16 @@ def test_tracks_need_no_registration_but_must_be_in_the_specimen_frame(
         build(small_specimen, tmp_path)
 
 
+def test_markers_named_from_the_other_end_are_refused_at_once(
+    small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
+) -> None:
+    moving, sigma = truth[1:], np.full_like(truth[1:], 1e-5)
+    write_q0_tracks(small_specimen, tmp_path, moving[:, ::-1], sigma)
+    message = r"frame 0: expected marker \w+ near its at_mm, [0-9.]+ mm from the clamp, found it [0-9.]+ mm off"
+    with pytest.raises(InputError, match=message):
+        build(small_specimen, tmp_path)
+
+
 def test_frames_are_selected_and_gaps_kept(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
     recorded = in_lab_frame(truth)
     recorded[4, 2:5] = np.nan

@@ -29,7 +29,9 @@ def test_markers_are_sorted_and_renamed(small_specimen: Specimen, tmp_path: Path
 
 @pytest.mark.parametrize("scale", [1e-3, 0.1, 10.0, 1e3])
 def test_a_wrong_unit_is_named(small_specimen: Specimen, scale: float) -> None:
-    with pytest.raises(InputError, match=r"recording a: expected markers up to .* the unit of a\.c3d is wrong"):
+    with pytest.raises(
+        InputError, match=r"recording a: expected markers up to .* not in mm, or the unit of a\.c3d is wrong"
+    ):
         in_layout_order(recording(small_specimen, scale), small_specimen, "a", {})
 
 

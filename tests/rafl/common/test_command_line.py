@@ -13,7 +13,7 @@ import typer
 from rich.console import Console
 from typer.testing import CliRunner
 
-from rafl.common.command_line import create_table, one_line, report_errors
+from rafl.common.command_line import create_table, next_command, one_line, report_errors
 from rafl.common.errors import InputError
 from rafl.common.files import atomic_file
 
@@ -101,3 +101,8 @@ def test_table_shows_names_as_they_are() -> None:
     Console(file=text, width=200).print(table)
     for name in ("error [px]", "[/b] of all", *names):
         assert name in text.getvalue()
+
+
+def test_next_command_can_be_pasted() -> None:
+    line = next_command("rafl-eval", Path("-run"), Path("a b") / "\u00fc.h5", "--out", "x", remark="(if at rest)")
+    assert line == "next: rafl-eval ./-run 'a b/\u00fc.h5' --out x (if at rest)"
