@@ -12,7 +12,7 @@ from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.data.objective import Objective
 from rafl.fitting.distributed import process_group
-from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs
+from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs, check_measurements
 from rafl.fitting.run_folder import (
     HISTORY_FILE,
     SETTINGS_FILE,
@@ -113,6 +113,7 @@ def fit(
                 sha256=tuple(map(sha256, paths)),
             )
             check_inputs(method, loaded, Path(start) if start else None, integrator)
+            check_measurements(loaded, settings)
             if group.is_main:
                 stack.enter_context(open_run(Path(run), settings, resume))
                 _notify_unused_settings(loaded, settings, notify, group.count)

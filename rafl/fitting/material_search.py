@@ -315,7 +315,7 @@ class MaterialSearch:
     @property
     def observed(self) -> float:
         """Number of coordinates that were observed."""
-        return sum(recordings.observed_coordinates for recordings in self.training)
+        return sum(float(recordings.compared_coordinates.sum()) for recordings in self.training)
 
     def parameter_table(self, minimum: Minimum) -> str:
         """CSV text with each value, its 95 % interval and its correlations with the others.
