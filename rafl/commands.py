@@ -1,6 +1,5 @@
 """What `rafl-fit` and `rafl-eval` do once their options are checked: call the library, print and write the results."""
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -40,7 +39,7 @@ from rafl.fitting.auto import SELECTION_FILE, selection_sentences
 from rafl.fitting.distributed import OtherProcessError, rank
 from rafl.fitting.fit import fit as fit_model
 from rafl.fitting.methods import DEFAULT_EPOCHS
-from rafl.fitting.quantities import METHOD_QUANTITIES, POISSON
+from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Report, load_model
 from rafl.fitting.sysid import parameter_sentences
 from rafl.simulation.device import require_device
@@ -151,8 +150,6 @@ def _describe(model: FittedModel) -> str:
             for key in ("youngs_modulus", "poissons_ratio", "viscosity", "branch_shares")
         )
         identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
-        if math.isclose(nu, POISSON.low):
-            identified += " (the lower bound: check the body's size, density and clamp, and the loads)"
         if viscosity.numel() and viscosity > 0.0:
             identified += f", viscosity = {viscosity:.0f} Pa s"
         if shares.numel():
