@@ -20,7 +20,7 @@ from rafl.common.kernels import announce_compilation
 from rafl.common.names import require_names
 from rafl.common.text_tables import spreadsheet_csv, spreadsheet_text
 from rafl.data.dataset import Dataset
-from rafl.data.dataset_file import read_dataset
+from rafl.data.dataset_file import read_dataset, read_datasets
 from rafl.evaluation.evaluation_file import EVALUATION_FILE, Evaluation, write_evaluation
 from rafl.evaluation.metrics import (
     Comparison,
@@ -181,7 +181,7 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool, de
     announce_compilation()
     require_writable(folder)
     models = _models_by_name(runs)
-    datasets = [read_dataset(path).on_device(device) for path in files]
+    datasets = [dataset.on_device(device) for dataset in read_datasets(files)]
     try:
         comparisons, failed = _compare_all(datasets, models)
     except SimulationError as error:
