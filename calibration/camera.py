@@ -12,6 +12,7 @@ Array = NDArray[Any]
 
 # Differences of [mx, my, skew] [px/mm], the rotation vector [rad], the offset [px], and k1, k2; far above rounding.
 PARAMETER_STEPS = (*(1e-4,) * 3, *(1e-6,) * 3, *(1e-3,) * 2, *(1e-6,) * 2)
+MAX_IMAGE_SIZE = 100_000  # [px]; no sensor has as many pixels along one of its sides
 COMPLEX_STEP = 1e-20  # [m]; its square vanishes beside 1 in the computer
 
 

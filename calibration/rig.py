@@ -8,7 +8,7 @@ import numpy as np
 import yaml
 from pydantic import Field, field_validator
 
-from rafl.calibration.camera import Camera, OrthographicCamera, Perspective, PinholeCamera, Plane
+from rafl.calibration.camera import MAX_IMAGE_SIZE, Camera, OrthographicCamera, Perspective, PinholeCamera, Plane
 from rafl.calibration.fields import Direction, PositivePair
 from rafl.common.errors import InputError
 from rafl.common.files import write_text
@@ -69,9 +69,9 @@ class _Entry(StrictModel):
 
     @field_validator("image_size")
     @classmethod
-    def _check_positive(cls, value: tuple[int, int]) -> tuple[int, int]:
-        if min(value) <= 0:
-            raise ValueError("expected two positive numbers")
+    def _check_size(cls, value: tuple[int, int]) -> tuple[int, int]:
+        if not 0 < min(value) <= max(value) <= MAX_IMAGE_SIZE:
+            raise ValueError(f"expected two positive numbers of at most {MAX_IMAGE_SIZE} px")
         return value
 
     @field_validator("covariance")

@@ -1,6 +1,5 @@
 """What `rafl-fit` and `rafl-eval` do once their options are checked: call the library, print and write the results."""
 
-import math
 from collections import Counter
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +20,7 @@ from rafl.common.kernels import announce_compilation
 from rafl.common.names import require_names
 from rafl.common.text_tables import spreadsheet_csv, spreadsheet_text
 from rafl.data.dataset import Dataset
-from rafl.data.dataset_file import read_dataset
+from rafl.data.dataset_file import read_dataset, read_datasets
 from rafl.evaluation.evaluation_file import EVALUATION_FILE, Evaluation, write_evaluation
 from rafl.evaluation.metrics import (
     Comparison,
@@ -40,7 +39,7 @@ from rafl.fitting.auto import SELECTION_FILE, selection_sentences
 from rafl.fitting.distributed import OtherProcessError, rank
 from rafl.fitting.fit import fit as fit_model
 from rafl.fitting.methods import DEFAULT_EPOCHS
-from rafl.fitting.quantities import METHOD_QUANTITIES, POISSON
+from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Report, load_model
 from rafl.fitting.sysid import parameter_sentences
 from rafl.simulation.device import require_device
@@ -151,8 +150,6 @@ def _describe(model: FittedModel) -> str:
             for key in ("youngs_modulus", "poissons_ratio", "viscosity", "branch_shares")
         )
         identified = f"identified E = {e / 1e3:.1f} kPa, nu = {nu:.4f}"
-        if math.isclose(nu, POISSON.low):
-            identified += " (the lower bound: check the body's size, density and clamp, and the loads)"
         if viscosity.numel() and viscosity > 0.0:
             identified += f", viscosity = {viscosity:.0f} Pa s"
         if shares.numel():
@@ -184,7 +181,7 @@ def evaluate(runs: list[Path], files: list[Path], folder: Path, report: bool, de
     announce_compilation()
     require_writable(folder)
     models = _models_by_name(runs)
-    datasets = [read_dataset(path).on_device(device) for path in files]
+    datasets = [dataset.on_device(device) for dataset in read_datasets(files)]
     try:
         comparisons, failed = _compare_all(datasets, models)
     except SimulationError as error:

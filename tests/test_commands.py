@@ -202,6 +202,8 @@ def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Pat
     (tmp_path / "odd" / "config.yaml").write_bytes(b"\xff\xfe")
     assert_refused(run("rafl-fit", "a.h5", "--out", "odd", "--epochs", "1", "--resume"), "config.yaml", "as YAML")
     assert_refused(run("rafl-eval", "nowhere", "a.h5"), "nowhere/model.pt")
+    assert_refused(run("rafl-fit", "a.h5", "a.h5", "--out", "run"), "each dataset once", "a.h5 in a.h5 again")
+    assert not (tmp_path / "run").exists()
     assert_refused(run("rafl-fit", "a.h5", "--out", "a.h5/run"), "a.h5", "check the path")
     done = run("rafl-fit", "a.h5", "--out", "run", "--method", "rafl", "--epochs", "1", "--frames", "3")
     assert done.returncode == 0, done.stderr
@@ -211,6 +213,7 @@ def test_fit_and_eval_refuse_wrong_input(built: Dataset, run: Run, tmp_path: Pat
     assert_refused(run("rafl-fit", "a.h5", "--out", "run", "--epochs", "2", "--resume"), "the settings")
     again = ("rafl-fit", "a.h5", "--out", "run", "--method", "rafl", "--epochs", "1", "--frames", "3", "--resume")
     assert run(*again).returncode == 0
+    assert_refused(run("rafl-eval", "run", "a.h5", "a.h5"), "each dataset once", "a.h5 in a.h5 again")
     write_dataset(tmp_path / "a.h5", replace(built, recipe="another"))
     assert_refused(run(*again), "run", "a.h5 has changed", "choose another --out")
     assert_refused(run("rafl-eval", "run", "a.h5", "--out", "out", "--device", "cuda:99"), "a CUDA device, found")

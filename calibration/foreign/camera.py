@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from rafl.calibration.camera import PinholeCamera
+from rafl.calibration.camera import MAX_IMAGE_SIZE, PinholeCamera
 from rafl.common.errors import InputError
 
 Array = NDArray[Any]
@@ -102,10 +102,10 @@ def read_image_size(value: Any, where: str) -> tuple[int, int]:
     """Width and height [px].
 
     Raises:
-        InputError: they are not two positive whole numbers.
+        InputError: they are not two positive whole numbers such as a sensor has.
     """
     width, height = read_numbers(value, (2,), where).tolist()
-    if min(width, height) < 1 or width % 1 or height % 1:
+    if not 1 <= min(width, height) <= max(width, height) <= MAX_IMAGE_SIZE or width % 1 or height % 1:
         raise InputError(f"{where}: expected a width and a height in px, found {width:g}, {height:g}; correct them")
     return int(width), int(height)
 

@@ -16,6 +16,8 @@ from rafl.data.dataset import Dataset
 Array = NDArray[Any]
 
 PREFIX = "camera_change_"  # of the names of attributes
+# Numbers of an attribute: turn, shift and clock; as many standard deviations; and seven of the pixels.
+CHANGE_NUMBERS = 2 * (CLOCK + 1) + 7
 CAMERA_HEADINGS = ("camera", "turned [degrees]", "shifted [mm]", "clock", "pixels moved", "left unexplained")
 MAX_SIGMAS = 3.0  # a larger change of the pixels is more than the calibration's uncertainty
 # Squared length of a change of the pose, in standard deviations, that is exceeded by chance as rarely as 3 sigmas: of a
@@ -124,13 +126,25 @@ def _pixel_change(change: CameraChange, camera: Camera, points: Array) -> tuple[
 
 
 def camera_rows(dataset: Dataset) -> list[CameraRow]:
-    """The changes of the cameras of a dataset; those of its latest recording if they differ."""
-    found: dict[str, object] = {}
-    for item in dataset.trajectories.values():
-        found |= {key.removeprefix(PREFIX): value for key, value in item.attributes.items() if key.startswith(PREFIX)}
+    """The changes of the cameras of a dataset; those of its latest recording if they differ.
+
+    Raises:
+        InputError: the attribute of a change is not what `change_attributes` makes.
+    """
+    found: dict[str, Array] = {}
+    for recording, item in dataset.trajectories.items():
+        for key, content in item.attributes.items():
+            if key.startswith(PREFIX):
+                numbers = np.asarray(content)
+                if numbers.shape != (CHANGE_NUMBERS,) or numbers.dtype.kind not in "fiu":
+                    raise InputError(
+                        f"{dataset.name}, recording {recording}, {key}: expected {CHANGE_NUMBERS} numbers, found "
+                        f"{content!r:.60}; build the dataset again"
+                    )
+                found[key.removeprefix(PREFIX)] = numbers.astype(float)
     rows = []
     for name, numbers in found.items():
-        value, sigma, pixels = np.split(np.asarray(numbers, dtype=float), [CLOCK + 1, 2 * CLOCK + 2])
+        value, sigma, pixels = np.split(numbers, [CLOCK + 1, 2 * CLOCK + 2])
         moved, moved_sigma, own, unexplained, length, expected, scale = pixels
         late, late_sigma = value[CLOCK], sigma[CLOCK]
         frames, frames_sigma = late / dataset.simulator.time_step, late_sigma / dataset.simulator.time_step

@@ -156,6 +156,7 @@ def print_contents(path: Path, console: Console) -> None:
         InputError: the file is no dataset, or is damaged.
     """
     dataset = read_dataset(path)
+    tables = [table for table in (recordings_table(dataset), cameras_table(dataset)) if table]
     simulator, mesh = dataset.simulator, dataset.simulator.mesh
     with h5py.File(path, "r") as file:
         created, software, units = (str(file.attrs.get(key, "-")) for key in ("created", "software", "units"))
@@ -177,9 +178,8 @@ def print_contents(path: Path, console: Console) -> None:
     }
     for key, text in lines.items():
         console.print(Text.assemble((key, "bold"), f": {text}"))
-    console.print(recordings_table(dataset))
-    if cameras := cameras_table(dataset):
-        console.print(cameras)
+    for table in tables:
+        console.print(table)
     for name, item in dataset.trajectories.items():
         values = item.attributes
         line = (

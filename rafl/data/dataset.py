@@ -12,6 +12,7 @@ from rafl.common.arrays import ArrayFormat, check_shape, check_values
 from rafl.common.names import check_distinct, check_names, check_visible
 from rafl.data.markers import Markers
 from rafl.data.views import VIEW_ARRAYS, View
+from rafl.simulation.newton import MAX_EDGE_CHANGE
 from rafl.simulation.rollout import Start
 from rafl.simulation.simulator import Simulator
 
@@ -23,6 +24,8 @@ THROUGH_MODEL = "through the model"  # begins the description of a registration 
 MAX_RELATIVE_TIME_ERROR = 5e-3
 # Of a camera's measurement to its row [frames]: half a frame if its clock is known, and what it was found late.
 MAX_LAG = 2.0
+MIN_VOLUME = 0.01  # of a cell in a first frame, as a share of that at rest; rubber keeps nearly all
+MIN_FIXED, MIN_SPREAD = 3, 1e-6  # number of fixed vertices; their spread across a line, as a share of that along it
 # The arrays of a dataset and of its file. N: nodes, E: elements, F: fixed nodes, M: markers, T: frames.
 MESH_ARRAYS = {
     "vertices": ArrayFormat(("N", 3)),
@@ -171,6 +174,35 @@ class Dataset:
         _require(bool(embedded.isfinite().all()), "markers/quad", "four different vertices of a face")
         for name, item in self.trajectories.items():
             self._check_trajectory(f"trajectories/{name}", item, {**lengths})
+
+    def check_mechanics(self) -> None:
+        """Check that consistent parts also make a body that is held, and first frames that it can be in.
+
+        Raises:
+            ValueError: a cell is there twice, the fixed vertices do not hold the body or are all of it, or a first
+                frame has inverted, flat or torn cells.
+        """
+        mesh, fixed = self.simulator.mesh, self.simulator.fixed
+        distinct = len(np.unique(np.sort(mesh.hexes, axis=1), axis=0)) == len(mesh.hexes)
+        _require(distinct, "mesh/hexes", "every cell once, found one twice: it would be twice as stiff")
+        _require(len(np.unique(fixed)) == len(fixed), "mesh/fixed", "every vertex once, found one twice")
+        _require(len(fixed) < len(mesh.vertices), "mesh/fixed", "some vertices that move, found all of them fixed")
+        spread = np.zeros(3)
+        if len(fixed) >= MIN_FIXED:
+            spread = np.linalg.svd(mesh.vertices[fixed] - mesh.vertices[fixed].mean(axis=0), compute_uv=False)
+        held = bool(spread[1] > MIN_SPREAD * spread[0])
+        _require(held, "mesh/fixed", f"{MIN_FIXED} vertices or more, not on one line, or else the body falls or turns")
+        for name, item in self.trajectories.items():
+            label, volume = f"trajectories/{name}/initial/q", mesh.deformed_volumes(item.q) / mesh.volumes
+            _require(
+                bool((volume > MIN_VOLUME).all()),
+                label,
+                f"cells of more than {MIN_VOLUME:g} of their volume at rest, found {volume.min():.3g} of cell "
+                f"{volume.argmin()}, which is inverted or flat",
+            )
+            change = float(mesh.max_edge_change(item.q[None] - mesh.vertices)[0])
+            expected = f"edges that change by less than {MAX_EDGE_CHANGE:g} times their length at rest"
+            _require(change < MAX_EDGE_CHANGE, label, f"{expected}, found {change:.3g}")
 
     def _check_names(self) -> None:
         """Recordings name parts of the file. The other names are only printed, and older files have any."""

@@ -2,23 +2,22 @@
 
 import datetime
 import hashlib
-import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import h5py
 import numpy as np
-import pydantic
 from numpy.typing import NDArray
 
 from rafl.calibration.rig import Rig, parse_calibration, rig_text
 from rafl.common.arrays import ArrayFormat, read_arrays
 from rafl.common.errors import InputError
+from rafl.common.files import find_copies
 from rafl.common.hdf5_files import read_hdf5, write_hdf5
 from rafl.common.names import require_names
 from rafl.common.version import VERSION
-from rafl.common.yaml_files import check_format, describe_validation
+from rafl.common.yaml_files import check_format
 from rafl.data.dataset import (
     INITIAL_ARRAYS,
     MARKER_ARRAYS,
@@ -27,6 +26,12 @@ from rafl.data.dataset import (
     RECORDING_ARRAYS,
     Dataset,
     Trajectory,
+)
+from rafl.data.dataset_attributes import (
+    FileAttributes,
+    MaterialAttributes,
+    RecordingAttributes,
+    check_attributes,
 )
 from rafl.data.markers import Markers
 from rafl.data.views import VIEW_ARRAYS, View
@@ -227,19 +232,37 @@ def read_dataset(path: str | Path) -> Dataset:
         check_format(str(file.attrs.get("format", "")), FORMAT, path)
         dataset = _read(file)
         dataset.check()
+        dataset.check_mechanics()
     if not dataset.trajectories:
         raise InputError(f"expected at least one trajectory in {path}, found none; run rafl-capture again")
     return dataset
 
 
+def read_datasets(paths: list[Path]) -> list[Dataset]:
+    """Read and check several dataset files.
+
+    Raises:
+        InputError: two hold the same, or as `read_dataset` says.
+    """
+    datasets = [read_dataset(path) for path in paths]
+    if copies := find_copies(paths):
+        raise InputError(
+            f"expected each dataset once, found {copies[0]} in {copies[1]} again, whose recordings would count twice; "
+            "name one of them"
+        )
+    return datasets
+
+
 def _read(file: h5py.File) -> Dataset:
+    _check_units(file)
     material = _attributes(file["material"])
+    check_attributes(MaterialAttributes, material, "material")
     if material["law"] not in tuple(LAWS):
         raise InputError(
             f"expected one of the laws {', '.join(LAWS)} in {file.filename}, found {material['law']!r}; "
             "register it first, in Python, with rafl.register_law"
         )
-    about = _FileAttributes.model_validate(_attributes(file))
+    about = FileAttributes.model_validate(_attributes(file))
     lengths: dict[str, int] = {}
     mesh = read_arrays(file["mesh"], MESH_ARRAYS, lengths, "mesh/")
     simulator = Simulator(
@@ -260,53 +283,24 @@ def _read(file: h5py.File) -> Dataset:
     return Dataset(about.name, simulator, markers, trajectories, about.recipe)
 
 
-class _FileAttributes(pydantic.BaseModel):
-    """Attributes of the file that are needed to simulate."""
+def _check_units(file: h5py.File) -> None:
+    """Raise ValueError if a unit is stated that is not that of the format. Those that are not stated are not missed."""
+    if (found := str(file.attrs.get("units", UNITS))) != UNITS:
+        raise ValueError(f"units: expected {UNITS!r}, found {found!r:.80}")
 
-    model_config = pydantic.ConfigDict(allow_inf_nan=False)
+    def check(name: str, item: h5py.Dataset | h5py.Group) -> None:
+        expected, _ = UNITS_AND_FRAMES.get(name.rpartition("/")[2], ("", ""))
+        if expected and (found := str(item.attrs.get("unit", expected))) != expected:
+            raise ValueError(f"{name}, unit: expected {expected!r}, found {found!r:.80}")
 
-    name: str
-    recipe: str
-    time_step: float = pydantic.Field(gt=0)
-    gravity: tuple[float, float, float]
-    integrator: str = "implicit-euler"
-    substeps: int = pydantic.Field(default=1, ge=1)
-
-
-def _positive_or_nan(value: float) -> float:
-    if not (math.isnan(value) or 0.0 < value < math.inf):
-        raise ValueError("expected a number above 0, or nan where nothing was measured")
-    return value
-
-
-_Count = Annotated[int, pydantic.Field(ge=0, strict=True)]
-_Measured = Annotated[float, pydantic.Field(strict=True, allow_inf_nan=True), pydantic.AfterValidator(_positive_or_nan)]
-
-
-class _RecordingAttributes(pydantic.BaseModel):
-    """Attributes of a recording that are used. Others are kept as they are."""
-
-    model_config = pydantic.ConfigDict(extra="allow", allow_inf_nan=False)
-
-    split: str
-    load_g: float | None = pydantic.Field(None, ge=0, strict=True)
-    still_frames: _Count = 0
-    first_frame: _Count = 0
-    not_free_frames: _Count = 0
-    registration: str = ""
-    bend_modulus: _Measured = float("nan")
-    swing_modulus: _Measured = float("nan")
-    swing_hz: _Measured = float("nan")
-    registration_modulus: _Measured = float("nan")
-    registration_modulus_sigma: _Measured = float("nan")
+    file.visititems(check)
 
 
 def _read_trajectory(group: h5py.Group, lengths: dict[str, int], label: str) -> Trajectory:
     attributes = _attributes(group)
-    try:
-        _RecordingAttributes.model_validate(attributes)
-    except pydantic.ValidationError as error:
-        raise ValueError(f"{label[:-1]}, {describe_validation(error)}") from None
+    check_attributes(RecordingAttributes, attributes, label[:-1])
+    if (found := len(attributes.get("fit_sigma_mm", ()))) not in (0, lengths["M"]):
+        raise ValueError(f"{label[:-1]}, fit_sigma_mm: expected {lengths['M']} numbers, one a marker, found {found}")
     return Trajectory(
         **read_arrays(group, RECORDING_ARRAYS, lengths, label),
         **read_arrays(group["initial"], INITIAL_ARRAYS, lengths, f"{label}initial/"),

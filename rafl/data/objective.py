@@ -161,11 +161,30 @@ class Recordings:
         return self.valid * several
 
     @property
-    def observed_coordinates(self) -> float:
-        """Number of coordinates after the first frame that the loss compares."""
+    def compared_coordinates(self) -> Tensor:
+        """Number of coordinates after the first frame that the loss compares, by recording (B)."""
         if self.in_image:
-            return sum(2.0 * float(term.seen[1:].sum()) for term in self.terms.values())
-        return float((self.weight[1:] > 0).sum())
+            return 2.0 * torch.stack([term.seen for term in self.terms.values()])[:, 1:].sum((0, 1, 3))
+        return (self.weight[1:] > 0).sum((0, 2, 3)).to(self.weight.dtype)
+
+    def require_measurements(self) -> None:
+        """Check that a simulation of every recording can be compared with something: it begins in the first frame.
+
+        Raises:
+            InputError: nothing was measured of a recording after its first frame.
+        """
+        if not (lacking := [b for b, count in enumerate(self.compared_coordinates.tolist()) if not count]):
+            return
+        kind, late = "a marker's position", ""
+        advice = "track these recordings again, or leave them out of recordings.csv, and run rafl-capture again"
+        if self.in_image:
+            kind, late = "a pixel", ", or only later than the last frame by the camera's clock"
+        elif bool(self.valid[1:, lacking].any()):
+            kind, advice = "a position of finite sigma", "fit without --by-sigma"
+        raise InputError(
+            f"{self.dataset.name}, recordings {', '.join(self.names[b] for b in lacking)}: expected {kind} after the "
+            f"first frame to compare the simulation with, found none in {len(self.markers)} frames{late}; {advice}"
+        )
 
     def simulate(
         self, residual: ResidualForce | None = None, parameters: Parameters | None = None
@@ -220,7 +239,8 @@ class Recordings:
 def _median_sigma(dataset: Dataset) -> float:
     """Median over all observed coordinates of a dataset [m]."""
     sigma = np.concatenate([item.sigma[item.valid].ravel() for item in dataset.trajectories.values()])
-    return float(np.median(sigma[np.isfinite(sigma)]))
+    known = sigma[np.isfinite(sigma)]
+    return float(np.median(known)) if known.size else 1.0  # any: an infinite sigma gives no weight
 
 
 def training_loss(recordings: Recordings, simulated: Tensor, forces: Tensor, force_penalty: float = 0.0) -> Tensor:

@@ -74,10 +74,12 @@ def compare(dataset: Dataset, models: dict[str, FittedModel]) -> list[Comparison
 
     Raises:
         SimulationError: a rollout failed; the message names recording and step.
-        InputError: a model is not applicable to this mesh.
+        InputError: a model is not applicable to this mesh, or nothing was measured of a recording after its first
+            frame.
     """
     names = list(dataset.trajectories)
     recordings = Recordings.of(dataset, names)
+    recordings.require_measurements()
     mesh, lengths = dataset.simulator.mesh, [len(dataset.trajectories[name].time) for name in names]
     simulated, distances, at_rest, motions, strains = {}, {}, {}, {}, {}
     with torch.no_grad():

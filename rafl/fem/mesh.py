@@ -163,6 +163,12 @@ class HexMesh:
         """Volume of each cell [m^3], (E,)."""
         return np.asarray(self.quadrature.volume.sum(axis=1))
 
+    def deformed_volumes(self, q: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Volume of each cell [m^3], (E,), with the vertices at q (N, 3) [m]; negative if it is inverted."""
+        rule = self.quadrature
+        deformation = np.einsum("eni,egnj->egij", q[self.hexes], rule.gradient, optimize=True)
+        return np.asarray((np.linalg.det(deformation) * rule.volume).sum(axis=1))
+
     @cached_property
     def edges(self) -> NDArray[np.int64]:
         """Vertex indices of each cell edge, once per edge, (K, 2)."""

@@ -9,10 +9,10 @@ from pathlib import Path
 from rafl.common.errors import InputError
 from rafl.common.files import new_folders, sha256
 from rafl.data.dataset import Dataset
-from rafl.data.dataset_file import read_dataset
+from rafl.data.dataset_file import read_datasets
 from rafl.data.objective import Objective
 from rafl.fitting.distributed import process_group
-from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs
+from rafl.fitting.methods import DEFAULT_EPOCHS, METHODS, check_inputs, check_measurements
 from rafl.fitting.run_folder import (
     HISTORY_FILE,
     SETTINGS_FILE,
@@ -92,7 +92,7 @@ def fit(
     with process_group() as group, ExitStack() as stack:
         with group.fail_together():
             require_device(device)
-            loaded = [read_dataset(path).on_device(device) for path in paths]
+            loaded = [dataset.on_device(device) for dataset in read_datasets(paths)]
             settings = Settings(
                 method=method,
                 datasets=tuple(str(path.resolve()) for path in paths),
@@ -113,6 +113,7 @@ def fit(
                 sha256=tuple(map(sha256, paths)),
             )
             check_inputs(method, loaded, Path(start) if start else None, integrator)
+            check_measurements(loaded, settings)
             if group.is_main:
                 stack.enter_context(open_run(Path(run), settings, resume))
                 _notify_unused_settings(loaded, settings, notify, group.count)

@@ -283,9 +283,8 @@ class MaterialSearch:
 
     def inside(self, x: Array) -> NDArray[np.int64]:
         """Indices of the variables that are not at a bound."""
-        lows, highs = self.bounds
-        margin = 1e-3 * (highs - lows)
-        return np.flatnonzero((lows + margin < x) & (x < highs - margin))
+        lows, highs = np.array([q.inside for q in self.quantities]).T
+        return np.flatnonzero((lows < x) & (x < highs))
 
     def covariance(self, minimum: Minimum) -> Array:
         """Covariance of the variables, (n, n).
@@ -315,7 +314,7 @@ class MaterialSearch:
     @property
     def observed(self) -> float:
         """Number of coordinates that were observed."""
-        return sum(recordings.observed_coordinates for recordings in self.training)
+        return sum(float(recordings.compared_coordinates.sum()) for recordings in self.training)
 
     def parameter_table(self, minimum: Minimum) -> str:
         """CSV text with each value, its 95 % interval and its correlations with the others.

@@ -11,7 +11,14 @@ from rafl.fitting.quantities import METHOD_QUANTITIES
 from rafl.fitting.run_folder import FittedModel, Report, Settings
 from rafl.fitting.supervised import fit_supervised, shared_vertex_count
 from rafl.fitting.sysid import fit_constitutive, identify_material
-from rafl.fitting.train_field import fit_residual_field, load_start_model, training_items
+from rafl.fitting.train_field import (
+    batches_by_dataset,
+    fit_residual_field,
+    load_start_model,
+    prepare_datasets,
+    training_items,
+    validation_batches,
+)
 from rafl.simulation.time_integration import INTEGRATORS
 
 FitFunction = Callable[[list[Dataset], Settings, Path, Report, ProcessGroup], FittedModel]
@@ -51,6 +58,17 @@ def check_inputs(method: str, datasets: list[Dataset], start: Path | None, integ
     training_items(datasets)
     if method == "srl":
         shared_vertex_count(datasets)
+
+
+def check_measurements(datasets: list[Dataset], settings: Settings) -> None:
+    """Check that there is something to fit to in every training recording, and to judge by in every validation one.
+
+    Raises:
+        InputError: nothing that the settings compare was measured of one after its first frame.
+    """
+    used = prepare_datasets(datasets, settings)
+    for recordings in (*batches_by_dataset(training_items(used), settings), *validation_batches(used)):
+        recordings.require_measurements()
 
 
 def _check_time_integration(datasets: list[Dataset], before: FittedModel, integrator: str) -> None:

@@ -12,6 +12,13 @@ from rafl.fem.learned.viscosity import UNITS as VISCOSITY_UNITS
 from rafl.fem.maxwell import branch_shares, branch_times
 
 FIXED_POISSONS_RATIO = 0.499  # nearly incompressible; where only E is identified, as in the paper
+BOUND_MARGIN = 1e-3  # share of the range of a variable within which it is at its bound
+# What to check where a value ends at a bound that a specimen does not reach.
+CHECK_BODY = (
+    "check the specimen's size and density, with their units, the clamped face, the loads in recordings.csv and the "
+    "frame rate"
+)
+CHECK_DAMPING = "check that nothing rubs on the body, that it is clamped firmly, and the frame rate"
 
 
 @dataclass(frozen=True)
@@ -28,6 +35,8 @@ class Quantity:
         start: value to start from if the assumed material has none, or less.
         deviation: standard deviation of the variable's prior around the assumed material.
         learned: whether the quantity is a weight of the constitutive residual.
+        symbol: for messages; the name if empty.
+        at_low, at_high: what to check where the value ends at that bound; empty if specimens reach it.
     """
 
     name: str
@@ -39,6 +48,9 @@ class Quantity:
     start: float = 0.0
     deviation: float = 3.0
     learned: bool = False
+    symbol: str = ""
+    at_low: str = ""
+    at_high: str = ""
 
     def variable(self, value: float) -> float:
         """The variable of a value."""
@@ -57,16 +69,41 @@ class Quantity:
         a, b = self.variable(self.low), self.variable(self.high)
         return min(a, b), max(a, b)
 
+    @property
+    def inside(self) -> tuple[float, float]:
+        """The variable's range without what counts as its bounds."""
+        low, high = self.bounds
+        margin = BOUND_MARGIN * (high - low)
+        return low + margin, high - margin
 
-MODULUS = Quantity("youngs_modulus", 2e4, 1e7, "log", "Pa", deviation=2.0)
-POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "log-gap", "", scale=0.05)
-VISCOSITY = Quantity("viscosity", 0.0, 1e4, "linear", "Pa s", scale=100.0, start=100.0)
-LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "linear", "", scale=0.1, start=0.1)
+    def at_bound(self, value: float) -> bool:
+        """Whether a value is at one of its bounds."""
+        low, high = self.inside
+        return not low < self.variable(value) < high
+
+    def bound_sentence(self, value: float) -> str:
+        """What a value tells that is at a bound which specimens do not reach; else empty."""
+        upper = abs(value - self.high) < abs(value - self.low)
+        check = self.at_high if upper else self.at_low
+        if not (check and self.at_bound(value)):
+            return ""
+        bound, asked = ("upper", "more") if upper else ("lower", "less")
+        shown = f"{1e-3 * value:g} kPa" if self.unit == "Pa" else f"{value:g} {self.unit}".strip()
+        return f"{self.symbol or self.name} is at its {bound} bound, {shown}: the recordings ask for {asked}; {check}"
+
+
+MODULUS = Quantity(
+    "youngs_modulus", 2e4, 1e7, "log", "Pa", deviation=2.0, symbol="E", at_low=CHECK_BODY, at_high=CHECK_BODY
+)
+POISSON = Quantity("poissons_ratio", 0.3, 0.4995, "log-gap", "", scale=0.05, symbol="nu", at_low=CHECK_BODY)
+VISCOSITY = Quantity("viscosity", 0.0, 1e4, "linear", "Pa s", scale=100.0, start=100.0, at_high=CHECK_DAMPING)
+LOSS_FACTOR = Quantity("tan_delta", 0.0, 0.5, "linear", "", scale=0.1, start=0.1, at_high=CHECK_DAMPING)
 # [Hz]; from the creep that a recording of a second or two shows (a relaxation time of 1 s) to half of 100 frames/s.
 LOSS_FREQUENCIES = (0.16, 50.0)
 BRANCH_TIMES = branch_times(*LOSS_FREQUENCIES)  # [s]
 SHARES = tuple(
-    Quantity(f"branch_share_{k + 1}", 0.0, 1.0, "linear", "", scale=0.1, start=0.05) for k in range(len(BRANCH_TIMES))
+    Quantity(f"branch_share_{k + 1}", 0.0, 1.0, "linear", "", scale=0.1, start=0.05, at_high=CHECK_DAMPING)
+    for k in range(len(BRANCH_TIMES))
 )
 # Weights that change the stress by as much as the law has, or the loss factor by some hundredths, are unusual.
 ENERGY_WEIGHTS = tuple(

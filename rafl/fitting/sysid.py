@@ -125,16 +125,18 @@ def _save(search: MaterialSearch, minimum: Minimum, run: Path) -> FittedModel:
 
 
 def parameter_sentences(table: pd.DataFrame, through_model: bool = False) -> list[str]:
-    """Sentences about the identified parameters, learned weights left out.
+    """Sentences about the identified parameters and their bounds, learned weights left out.
 
     Args:
         table: `parameters.csv` as read.
         through_model: whether the frame of some recordings was found through the assumed material.
     """
-    learned = [quantity.name for quantity in METHOD_QUANTITIES["constitutive"] if quantity.learned]
-    table = table[~table["name"].isin(learned)].reset_index(drop=True)
+    quantities = {quantity.name: quantity for own in METHOD_QUANTITIES.values() for quantity in own}
+    table = table[[not quantities[name].learned for name in table["name"]]].reset_index(drop=True)
     lines = []
     found = np.isfinite(table["low_95"]).any()
+    pairs = [(quantities[name], value) for name, value in zip(table["name"], table["value"], strict=True)]
+    at_bound = [quantity.at_bound(value) for quantity, value in pairs]
     for row in table.to_dict("records") if found else []:
         unit = f" {row['unit']}" if isinstance(row["unit"], str) else ""
         interval = f"95 % interval {row['low_95']:.5g} to {row['high_95']:.5g}"
@@ -146,11 +148,12 @@ def parameter_sentences(table: pd.DataFrame, through_model: bool = False) -> lis
             "no 95 % intervals: the frame of the recordings was found through the assumed material, and E follows it; "
             "film the undeformed specimen (rafl-capture --rest), or put three markers on the clamp"
         )
-    elif not found:
+    elif not found and not all(at_bound):
         lines.append(
             "no 95 % intervals: the search ended before a minimum, as that of the default does once the error hardly "
-            "falls, or all values are at their bounds; --method sysid-branches searches on"
+            "falls; --method sysid-branches searches on"
         )
+    lines += [sentence for quantity, value in pairs if (sentence := quantity.bound_sentence(value))]
     for a, b in itertools.combinations(range(len(table)), 2):
         c = float(table[f"correlation_{table['name'][b]}"][a])
         if abs(c) > MIN_REPORTED_CORRELATION:

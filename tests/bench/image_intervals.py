@@ -171,7 +171,7 @@ def share_inside(exact: Dataset, film: Callable[[np.random.Generator], Dataset],
         curvature = loss_curvature(recordings, markers[:, 0], slope)
         step = -torch.linalg.solve(curvature, by_variable)
         least = float(loss.detach() + 0.5 * by_variable @ step)
-        freedom = recordings.observed_coordinates - count
+        freedom = float(recordings.compared_coordinates.sum()) - count
         sigma = (2.0 * least / freedom * torch.linalg.inv(curvature)).diagonal().sqrt()
         inside.append((step.abs() <= NORMAL_QUANTILE_95 * sigma).numpy())
     result: np.ndarray = 100.0 * np.mean(inside, axis=0)

@@ -74,6 +74,7 @@ def test_what_only_matlab_can_read_says_how_to_export(tmp_path: Path) -> None:
         ("IntrinsicMatrix", "eye", "expected 9 numbers"),
         ("RadialDistortion", [np.nan, 0.0], "not finite"),
         ("ImageSize", [0.0, 5.0], "a width and a height in px"),
+        ("ImageSize", [1e9, 5.0], "a width and a height in px"),
     ],
 )
 def test_bad_values_are_refused(tmp_path: Path, key: str, value: object, message: str) -> None:

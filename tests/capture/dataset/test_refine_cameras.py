@@ -164,6 +164,14 @@ def test_pixels_that_no_moved_camera_explains_accuse_no_camera(datasets: tuple[D
     assert [name for name, row in rows.items() if not row.explained] == ["left"]
 
 
+@pytest.mark.parametrize("damaged", ["<b>", 3.0, (1.0, 2.0, 3.0), ("a",) * 21])
+def test_changes_that_are_no_such_numbers_are_refused(datasets: tuple[Dataset, Dataset], damaged: object) -> None:
+    swing = datasets[1].trajectories["swing"]
+    worse = replace(swing, attributes=swing.attributes | {"camera_change_left": damaged})
+    with pytest.raises(InputError, match="recording swing, camera_change_left: expected 21 numbers, found"):
+        camera_rows(replace(datasets[1], trajectories={"swing": worse}))
+
+
 def test_errors_of_the_model_are_not_taken_for_a_turn(
     tmp_path: Path, front: Specimen, motion: np.ndarray, monkeypatch: pytest.MonkeyPatch
 ) -> None:

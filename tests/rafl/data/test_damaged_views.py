@@ -107,6 +107,10 @@ DAMAGE: dict[str, tuple[Callable[[h5py.Group], None], str]] = {
     "newer": (calibration("rafl-calibration/1", "rafl-calibration/9"), f"{CALIBRATION}: .* newer"),
     "unknown model": (calibration("orthographic", "fisheye"), f"{CALIBRATION}: .*cameras.left"),
     "not a number": (calibration("skew: 0.0", "skew: .nan"), f"{CALIBRATION}: .*cameras.left"),
+    "endless image": (
+        calibration("image_size: [", "image_size: [1000"),
+        f"{CALIBRATION}: .*image_size: expected two positive numbers of at most 100000 px, found",
+    ),
     "unlisted camera": (calibration("left:", "other:"), "trajectories/b/views: expected the cameras other, pin, found"),
     "lost camera": (remove("left"), "trajectories/b/views: expected the cameras left, pin, found pin"),
     "array for a camera": (

@@ -141,7 +141,67 @@ DAMAGE: dict[str, tuple[str, Callable[[h5py.File], object]]] = {
     "text for a number in an attribute": ("time_step: Input", lambda file: file.attrs.update({"time_step": "fast"})),
     "infinite stiffness": ("finite", lambda file: file["material"].attrs.modify("youngs_modulus", np.inf)),
     "damping that is no number": ("finite", lambda file: file["material"].attrs.modify("viscosity", np.nan)),
-    "unknown property": ("cannot be read", lambda file: file["material"].attrs.modify("colour", 1.0)),
+    "unknown property": (
+        "material, colour: Extra inputs are not permitted, found 'red'",
+        lambda file: file["material"].attrs.modify("colour", "red"),
+    ),
+    "text for a stiffness": (
+        "material, youngs_modulus: Input should be a valid number, found 'soft'",
+        lambda file: file["material"].attrs.create("youngs_modulus", "soft"),
+    ),
+    "several stiffnesses": (
+        r"material, youngs_modulus: Input should be a valid number, found \(1.0, 1.0\)",
+        lambda file: file["material"].attrs.create("youngs_modulus", np.ones(2)),
+    ),
+    "all vertices fixed": (
+        "mesh/fixed: expected some vertices that move",
+        lambda file: replace_array(file, "mesh/fixed", np.arange(63)),
+    ),
+    "no vertices fixed": (
+        "mesh/fixed: expected 3 vertices or more, not on one line",
+        lambda file: replace_array(file, "mesh/fixed", np.zeros(0, dtype=int)),
+    ),
+    "a line of vertices fixed": (
+        "mesh/fixed: expected 3 vertices or more, not on one line",
+        lambda file: replace_array(file, "mesh/fixed", np.arange(3)),
+    ),
+    "vertices fixed twice": (
+        "mesh/fixed: expected every vertex once",
+        lambda file: replace_array(file, "mesh/fixed", np.zeros(9, dtype=int)),
+    ),
+    "cells twice": (
+        "mesh/hexes: expected every cell once",
+        lambda file: replace_array(file, "mesh/hexes", np.concatenate([file["mesh/hexes"][()]] * 2)),
+    ),
+    "first state of no extent": (
+        "trajectories/a/initial/q: expected cells of more than 0.01 of their volume at rest, found 0 of cell 0",
+        lambda file: file["trajectories/a/initial/q"].write_direct(np.zeros((63, 3))),
+    ),
+    "inverted first state": (
+        "trajectories/a/initial/q: expected cells .* found -1 of cell",
+        lambda file: file["trajectories/a/initial/q"].write_direct(file["mesh/vertices"][()] * [1.0, 1.0, -1.0]),
+    ),
+    "first state in mm": (
+        "trajectories/a/initial/q: expected edges that change by less than 30 times",
+        lambda file: file["trajectories/a/initial/q"].write_direct(1e3 * file["trajectories/a/initial/q"][()]),
+    ),
+    "another unit": (
+        "mesh/vertices, unit: expected 'm', found 'mm'",
+        lambda file: file["mesh/vertices"].attrs.modify("unit", "mm"),
+    ),
+    "other units": ("units: expected 'SI: m, .*, found 'mm'", lambda file: file.attrs.modify("units", "mm")),
+    "text for sigmas": (
+        "trajectories/a, fit_sigma_mm: Input should be a valid tuple, found '<b>'",
+        lambda file: file["trajectories/a"].attrs.modify("fit_sigma_mm", "<b>"),
+    ),
+    "one sigma": (
+        "trajectories/a, fit_sigma_mm: Input should be a valid tuple, found 3.0",
+        lambda file: file["trajectories/a"].attrs.modify("fit_sigma_mm", 3.0),
+    ),
+    "too few sigmas": (
+        "trajectories/a, fit_sigma_mm: expected 20 numbers",
+        lambda file: file["trajectories/a"].attrs.modify("fit_sigma_mm", np.full(3, np.nan)),
+    ),
     "newer version": ("newer", lambda file: file.attrs.modify("format", "rafl-dataset/7")),
 }
 
@@ -246,6 +306,14 @@ def test_every_array_has_a_unit_and_a_frame(dataset: Dataset, tmp_path: Path) ->
         file.visititems(check)
         assert file["trajectories/a/initial/v"].attrs["unit"] == "m/s"
     assert missing == []
+
+
+def test_units_that_older_files_do_not_state_are_not_missed(dataset: Dataset, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    with h5py.File(path, "r+") as file:
+        del file.attrs["units"], file["mesh/vertices"].attrs["unit"]
+    np.testing.assert_array_equal(read_dataset(path).simulator.mesh.vertices, dataset.simulator.mesh.vertices)
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, write_dataset
 from rafl.data.objective import Recordings, frame_errors, loss_curvature, recording_losses, training_loss
 from rafl.data.views import View, at_lags, seen_axes
+from rafl.evaluation.metrics import compare
 from rafl.fitting.fit import fit
 
 CAMERAS = {"left": side_camera(0.0), "right": side_camera(np.pi / 2)}
@@ -353,3 +354,38 @@ def test_settings_without_effect_on_pixels_are_told(dataset: Dataset, tmp_path: 
         fit(tmp_path / f"{name}.h5", tmp_path / name, **options)  # type: ignore[arg-type]
         assert len(told) == 1
         assert message in told[0]
+
+
+def test_recordings_with_nothing_to_compare_are_named(dataset: Dataset, tmp_path: Path) -> None:
+    """A simulation begins in the first frame: what was measured there, or after the last frame, tells nothing."""
+    with_views = filmed(dataset, CAMERAS)
+    item, step = with_views.trajectories["a"], dataset.simulator.time_step
+
+    def only(frame: int, lag: float) -> Recordings:
+        views = {}
+        for name, view in item.views.items():
+            pixel, covariance = np.full_like(view.pixel, np.nan), np.full_like(view.covariance, np.nan)
+            pixel[frame], covariance[frame] = view.pixel[frame], view.covariance[frame]
+            late = np.full(len(item.time), lag)
+            views[name] = replace(view, pixel=pixel, covariance=covariance, lag=late)
+        items = with_views.trajectories | {"a": replace(item, views=views)}
+        return Recordings.of(replace(with_views, trajectories=items), ["a", "b"])
+
+    only(-1, 0.0).require_measurements()
+    only(1, 0.5 * step).require_measurements()
+    for frame, lag in ((0, 0.0), (-1, 0.5 * step)):
+        with pytest.raises(InputError, match="small, recordings a: expected a pixel after the first frame"):
+            only(frame, lag).require_measurements()
+    valid = np.zeros_like(item.valid)
+    valid[0] = True
+    first = replace(dataset, trajectories={"a": replace(dataset.trajectories["a"], valid=valid)})
+    with pytest.raises(InputError, match="recordings a: expected a marker's position after the first frame"):
+        compare(first, {})
+    unknown = replace(dataset.trajectories["a"], sigma=np.full_like(dataset.trajectories["a"].sigma, np.inf))
+    recordings = Recordings.of(replace(dataset, trajectories={"a": unknown}), ["a"], by_sigma=True)
+    with pytest.raises(InputError, match="recordings a: expected a position of finite sigma"):
+        recordings.require_measurements()
+    write_dataset(tmp_path / "first.h5", first)
+    with pytest.raises(InputError, match="recordings a: expected a marker's position"):
+        fit(tmp_path / "first.h5", tmp_path / "run", "sysid-e")
+    assert not (tmp_path / "run").exists()

@@ -1,3 +1,4 @@
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -310,6 +311,27 @@ def test_correlated_parameters_are_reported() -> None:
     assert "1.9e+05 to 2.1e+05" in first
     assert "no interval" in second
     assert "-0.970" in third
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        ("youngs_modulus", 1e7, "E is at its upper bound, 10000 kPa: the recordings ask for more; check .*density"),
+        ("youngs_modulus", 2e4, "E is at its lower bound, 20 kPa: the recordings ask for less; check .*density"),
+        ("poissons_ratio", 0.3, "nu is at its lower bound, 0.3: "),
+        ("poissons_ratio", 0.4995, ""),
+        ("viscosity", 0.0, ""),
+        ("tan_delta", 0.5, "tan_delta is at its upper bound, 0.5: "),
+        ("branch_share_2", 1.0, "branch_share_2 is at its upper bound, 1: "),
+        ("energy_weight_1", 1.0, ""),
+    ],
+)
+def test_values_at_bounds_that_no_specimen_reaches_are_told(name: str, value: float, told: str) -> None:
+    """Rubber is nearly incompressible, and may have no viscosity."""
+    row = {"name": name, "unit": np.nan, "value": value, "low_95": np.nan, "high_95": np.nan}
+    lines = parameter_sentences(pd.DataFrame([row | {f"correlation_{name}": np.nan}]))
+    assert len(lines) == bool(told)
+    assert re.match(told, "".join(lines))
 
 
 def test_supervised_residual_network(dataset: Dataset, tmp_path: Path) -> None:
