@@ -1,13 +1,13 @@
 """The search for the virtual forces of a first frame, under one prior of how the body is loaded."""
 
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from rafl.capture.registration.first_frame import RESULTANT_SIGMA, FirstFrame, rigid_modes
+from rafl.capture.registration.first_frame import FirstFrame, rigid_modes
 from rafl.capture.registration.rigid import RigidTransform, kabsch
 from rafl.common.errors import SimulationError
 from rafl.data.views import pose_jacobian
@@ -15,7 +15,7 @@ from rafl.data.views import pose_jacobian
 Array = NDArray[Any]
 
 MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
-LEAST_PULL = 1e-3  # taken for a weight where what is found is less or pulls upwards; what no load may exert [N]
+LEAST_PULL = 1e-3  # taken for a weight where what is found is less, or upwards [N]
 INITIAL_DAMPING = 1e4  # of a Levenberg-Marquardt step, as a multiple of the prior
 MAX_ITERATIONS, MAX_TRIALS = 100, 6  # of one search, and of one step; the sixth is damped 2^15 times as much
 # The search ends where an undamped step promises a smaller decrease: relative to the objective, plus absolute.
@@ -32,13 +32,13 @@ class ForcePrior:
             [N].
         shape_sigma: standard deviation of the loaded nodes from a rigid motion of them all [m]; infinite if they may
             deform.
-        load: `weight` pulls along gravity (`FirstFrame.hanging_precision`), `none` leaves the body to its own weight.
+        hanging: whether the force is that of a weight, which pulls along gravity (`FirstFrame.hanging_precision`).
     """
 
     name: str
     local_sigma: float
     shape_sigma: float = np.inf
-    load: Literal["any", "weight", "none"] = "any"
+    hanging: bool = False
 
     def precision(self, frame: FirstFrame, pull: float) -> Array:
         """Inverse prior covariance of the forces on the frame's nodes [1/N^2], (3 L, 3 L).
@@ -51,12 +51,9 @@ class ForcePrior:
 
     def resultant_precision(self, frame: FirstFrame, pull: float) -> Array:
         """That of the amplitudes of `FirstFrame.resultant_modes` [1/N^2], (n, n)."""
-        _, sigma = frame.resultant_modes()
-        if self.load == "any":
-            return np.diag(sigma**-2.0)
-        if self.load == "weight":
+        if self.hanging:
             return frame.hanging_precision(max(pull, LEAST_PULL))
-        return np.diag((sigma * LEAST_PULL / RESULTANT_SIGMA) ** -2.0)
+        return np.diag(frame.resultant_modes()[1] ** -2.0)
 
 
 @dataclass(frozen=True)

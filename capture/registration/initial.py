@@ -14,13 +14,15 @@ from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 
 Array = NDArray[Any]
 
-# What may load the free end: nothing; a weight that hangs from it; any force and moment, and practically nothing else;
-# a hand that holds it, so that it hardly deforms (by 10 um, as little as a first frame tells); local forces, which dent
-# it. At rest without a force upwards, the first two are possible.
-UNLOADED, WEIGHT = ForcePrior("no load", 1e-5, load="none"), ForcePrior("hanging weight", 1e-5, load="weight")
+# What may load the free end: a weight that hangs from it; any force and moment, and practically nothing else; a hand
+# that holds it, so that it hardly deforms (by 10 um, as little as a first frame tells); local forces, which dent it.
+WEIGHT = ForcePrior("hanging weight", 1e-5, hanging=True)
 PULL, HELD = ForcePrior("force and moment", 1e-5), ForcePrior("held end", 10.0, shape_sigma=1e-5)
 LOCAL = tuple(ForcePrior("local forces", sigma) for sigma in (5e-3, 5e-2, 0.5))
 SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act on the whole surface
+# Of the body's own weight. Where E is too small by its prior's sigma, a beam on which nothing hangs seems to be pushed
+# up at its tip by 3/8 (1 - exp(-0.5)) of it.
+UPWARD_SHARE = 0.15
 REFITS = 5  # at most, with the error of the mesh that the last fit makes most probable
 SETTLED = 1.2  # ratio of standard deviations of the markers in successive fits; a smaller one ends the refits
 FORCE_CHANGE = LOCAL[0]  # prior of the forces whose change gives the velocity of a body in motion
@@ -116,9 +118,8 @@ def _fit_tip(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -
     found = first.minimise(np.zeros_like(frame.simulator.mesh.vertices), pose or IDENTITY, None)
     fits = [_refit(first, prior, found, error) for prior in (PULL, HELD)]
     if np.any(frame.simulator.gravity) and not frame.moving:
-        fits.append(_refit(first, UNLOADED, found, error))
         hung = _refit(first, WEIGHT, found, error)
-        if _pull(frame, hung.found.force) > 0.0:  # a weight does not pull upwards
+        if _may_hang(frame, hung.found.force):
             fits.append(hung)
     best = max(fits, key=lambda fit: fit.evidence)
     if (best.sizes.values > ASSUMED.values).any():
@@ -164,6 +165,11 @@ def _pull(frame: FirstFrame, force: Array) -> float:
     return float(force.sum(axis=0) @ gravity / max(np.linalg.norm(gravity), np.finfo(float).tiny))
 
 
+def _may_hang(frame: FirstFrame, force: Array) -> bool:
+    """Whether forces (N, 3) may be those of a weight, or of none, which do not push upwards."""
+    return _pull(frame, force) > -UPWARD_SHARE * _pull(frame, frame.simulator.weight)
+
+
 @dataclass(frozen=True)
 class ResultantFit:
     """A fit of the first frame by a force and a moment on the nodes.
@@ -192,9 +198,9 @@ class ResultantFit:
         shared: whitened derivatives of the residuals by numbers of mean zero and variance one that all first frames
             have in common, (K, S).
         """
-        pull = _pull(frame, self.force)
-        if pull <= 0.0:
+        if not _may_hang(frame, self.force):
             return PULL
+        pull = _pull(frame, self.force)
         residual = self.whitening @ self.residual - self.jacobian @ self.amplitude
         known = np.eye(len(residual)) + shared @ shared.T
 
