@@ -23,7 +23,9 @@ SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act 
 # Of the body's own weight. Where E is too small by its prior's sigma, a beam on which nothing hangs seems to be pushed
 # up at its tip by 3/8 (1 - exp(-0.5)) of it.
 UPWARD_SHARE = 0.15
-FLAT = 0.05  # spread of markers on one plane across it, relative to that along it; dots of a flat face have 0.01
+# Spread of markers on one plane across it, relative to that along it. Places half a millimetre off on a face of 100 mm
+# make it 0.02; two sides of a beam a fifth as wide as long, 0.3.
+FLAT = 0.05
 REFITS = 5  # at most, with the error of the mesh that the last fit makes most probable
 SETTLED = 1.2  # ratio of standard deviations of the markers in successive fits; a smaller one ends the refits
 FORCE_CHANGE = LOCAL[0]  # prior of the forces whose change gives the velocity of a body in motion

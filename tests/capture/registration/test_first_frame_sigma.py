@@ -65,10 +65,13 @@ def test_one_camera_leaves_the_depth_uncertain_and_two_do_not(front: Specimen) -
 
 
 def test_a_load_that_is_hardly_less_probable_counts(front: Specimen) -> None:
-    """A pull of five degrees off gravity is taken for a hanging weight; any force is hardly less probable."""
+    """A pull of five degrees off gravity is taken for a hanging weight; any force is hardly less probable.
+
+    The seed is one where the two are near each other. Under the weight alone the largest error is 1.9 sigmas.
+    """
     error, seen, sigma = fit_noisy(front, {"left": side_camera(0.0)}, 12, 0.1)
     assert np.abs(error[seen, 2]).max() > 1e-4
-    assert (np.abs(error[seen, 2]) < 2.0 * sigma[seen]).all()
+    assert (np.abs(error[seen, 2]) < 1.5 * sigma[seen]).all()
 
 
 @pytest.mark.slow
