@@ -223,7 +223,7 @@ def check_near_clamp(dataset: Dataset, specimen: Specimen, item: Registered, tol
         dataset: with the markers as described.
         specimen: its description.
         item: the recording; not checked if its pose is still unknown.
-        tolerance: [m].
+        tolerance: distance by which a marker may be farther off than that [m].
 
     Raises:
         InputError: in the first frame, a marker is farther from its place.
@@ -242,7 +242,7 @@ def check_near_clamp(dataset: Dataset, specimen: Specimen, item: Registered, tol
             f"recording {frame.recording}, frame {item.start.frame}: expected marker {name} near its at_mm, "
             f"{1e3 * distance[worst]:.1f} mm from the clamp, found it {1e3 * moved[worst]:.1f} mm off. Either names or "
             "at_mm of markers are wrong, or this is another specimen, or the calibration's world is not the specimen's "
-            f"frame, or {OTHER_SET_UP}"
+            f"frame, or {OTHER_SET_UP}; --fit-tolerance-mm allows more"
         )
 
 

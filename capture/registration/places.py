@@ -56,8 +56,8 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
 
     with R recordings, and a model_sigma of each that follows from its deflection (`MODEL_FRACTION`). The forces are
     eliminated recording by recording. Where markers of one side only are seen, they may be those of a hanging weight
-    (`ResultantFit.most_probable_prior`): sideways forces that nobody exerted would move the places. A pose and an unknown force can hardly be told apart, nor
-    then can E; known loads decide (`FirstFrame.load`).
+    (`ResultantFit.most_probable_prior`): sideways forces that nobody exerted would move the places. A pose and an
+    unknown force can hardly be told apart, nor then can E; known loads decide (`FirstFrame.load`).
 
     Args:
         frames: observations, with the markers embedded at their places in the layout.
