@@ -28,6 +28,13 @@ class Background(StrEnum):
     clutter = "clutter"
 
 
+class SideCamera(StrEnum):
+    """A camera that faces a side of the specimen."""
+
+    left = "left"
+    right = "right"
+
+
 class Codec(StrEnum):
     """How videos are encoded."""
 
@@ -56,10 +63,14 @@ def render(
     ] = 0.2,
     noise: Annotated[float, typer.Option(min=0.0, help="Sigma of the sensor noise [grey levels].")] = 2.0,
     background: Annotated[Background, typer.Option(help="Background behind the specimen.")] = Background.plain,
+    camera: Annotated[
+        list[SideCamera] | None,
+        typer.Option(help="Only this camera films; left faces the side of least y. [default: both]", show_default=False),
+    ] = None,
     codec: Annotated[Codec, typer.Option(help="Video encoding.")] = Codec.h264,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of noise and camera misalignment.")] = 0,
 ) -> None:
-    """Simulate a specimen of a chosen true material and render videos of it from two cameras.
+    """Simulate a specimen of a chosen true material and render videos of it from two cameras, or from one.
 
     Writes videos/, calibration/ (board images), recordings.csv and truth.h5.
 
@@ -74,8 +85,9 @@ def render(
     from rafl.capture import commands
 
     material = commands.TrueMaterial(youngs_modulus, poissons_ratio)
+    cameras = sorted({each.value for each in camera or SideCamera})
     appearance = commands.create_appearance(dot_mm, blur_px, exposure, noise, background.value)
-    commands.render(specimen, out, loads, twists, frames, fps, material, appearance, codec.value, seed)
+    commands.render(specimen, out, loads, twists, frames, fps, material, appearance, cameras, codec.value, seed)
 
 
 def _numbers(text: str, option: str, low: float) -> list[float]:

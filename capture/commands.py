@@ -83,10 +83,13 @@ def render(
     fps: float,
     true: TrueMaterial,
     appearance: Appearance,
+    cameras: list[str],
     codec: str,
     seed: int,
 ) -> None:
     """Simulate the releases and write videos, board images, recordings.csv and truth.h5.
+
+    cameras: names of those that film, of `film.CAMERA_AXES`. The other options are those of the command.
 
     Raises:
         InputError: the specimen cannot be read, its markers cannot be drawn, or a motion cannot be simulated.
@@ -113,7 +116,8 @@ def render(
             raise InputError(f"the motion cannot be simulated: {error}") from None
         motions = _with_distinct_names(motions)
         random = np.random.default_rng(seed)
-        rig = side_cameras(described, motions, random)
+        both = side_cameras(described, motions, random)
+        rig = replace(both, cameras={name: both.cameras[name] for name in cameras})
         write_board_images(out / "calibration", rig, appearance, random)
         renderers = {name: Renderer.of(described, camera, appearance, random) for name, camera in rig.cameras.items()}
         task = bar.add_task("rendering", total=frames * len(motions) * len(renderers))
