@@ -65,7 +65,9 @@ def render(
     background: Annotated[Background, typer.Option(help="Background behind the specimen.")] = Background.plain,
     camera: Annotated[
         list[SideCamera] | None,
-        typer.Option(help="Only this camera films; left faces the side of least y. [default: both]", show_default=False),
+        typer.Option(
+            help="Only this camera films; left faces the side of least y. [default: both]", show_default=False
+        ),
     ] = None,
     codec: Annotated[Codec, typer.Option(help="Video encoding.")] = Codec.h264,
     seed: Annotated[int, typer.Option(min=0, help="Random seed of noise and camera misalignment.")] = 0,

@@ -11,10 +11,16 @@ from rafl.capture.registration.first_frame import FirstFrame, rigid_modes
 from rafl.capture.registration.rigid import RigidTransform, kabsch
 from rafl.common.errors import SimulationError
 from rafl.data.views import pose_jacobian
+from rafl.fitting.quantities import POISSON
+from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
 MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
+# Of the variables of the material, log E and log(1/2 - nu), less those of the assumed material.
+MATERIAL_SIGMA = np.array([MODULUS_SIGMA, POISSON.deviation])
+ASSUMED_MATERIAL = np.zeros(2)
+POISSON_STEP = 1e-3  # of log(1/2 - nu), for the derivatives by it
 LEAST_PULL = 1e-3  # taken for a weight where what is found is less, or upwards [N]
 INITIAL_DAMPING = 1e4  # of a Levenberg-Marquardt step, as a multiple of the prior
 MAX_ITERATIONS, MAX_TRIALS = 100, 6  # of one search, and of one step; the sixth is damped 2^15 times as much
@@ -61,8 +67,8 @@ class Estimate:
     """A loaded body.
 
     Attributes:
-        frame: observation, with a simulator of the modulus that is tried.
-        log_modulus: logarithm of that modulus over the assumed one.
+        frame: observation, with a simulator of the material that is tried.
+        material: variables of that material, less those of the assumed one, (2): see `with_changed_material`.
         force: virtual nodal forces [N], (N, 3).
         pose: from the frame of the target to the specimen frame.
         q: node positions in equilibrium [m], (N, 3).
@@ -72,7 +78,7 @@ class Estimate:
     """
 
     frame: FirstFrame
-    log_modulus: float
+    material: Array
     force: Array
     pose: RigidTransform
     q: Array
@@ -90,7 +96,7 @@ class ForceSearch:
         whitening: that turns the markers' residuals into independent numbers of variance one [1/m], (K, 3 M'). A depth
             that no camera observed is an assumption, and the same one for all markers: it has no part in them.
         with_pose: whether the pose is fitted too.
-        with_modulus: whether Young's modulus is fitted too, around the assumed one.
+        with_material: whether Young's modulus and Poisson's ratio are fitted too, around the assumed ones.
         pull: of what hangs on the nodes [N], about, for the prior of a hanging weight.
     """
 
@@ -100,17 +106,17 @@ class ForceSearch:
         prior: ForcePrior,
         whitening: Array,
         with_pose: bool,
-        with_modulus: bool,
+        with_material: bool,
         pull: float,
     ) -> None:
-        self.frame, self.prior, self.with_pose, self.with_modulus = frame, prior, with_pose, with_modulus
+        self.frame, self.prior, self.with_pose, self.with_material = frame, prior, with_pose, with_material
         self.whitening = whitening
         self.precision = prior.precision(frame, pull)
         self.expected = frame.expected_force()
 
-    def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float) -> Estimate:
+    def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, material: Array) -> Estimate:
         """Equilibrium, residual and objective, with the solve started at `start` (N, 3) if given."""
-        frame = _softened(self.frame, log_modulus)
+        frame = replace(self.frame, simulator=with_changed_material(self.frame.simulator, material))
         simulator = frame.simulator
         total, label = (simulator.weight + force)[None], f"{frame.recording}: first frame"
         if start is None:
@@ -122,13 +128,15 @@ class ForceSearch:
         residual = frame.along_axes(positions - pose.apply(frame.target[frame.measured])).ravel()
         shape = self._shape(q)
         f = force[frame.nodes].ravel() - self.expected
-        by_prior = f @ self.precision @ f + shape @ shape + (log_modulus / MODULUS_SIGMA) ** 2
+        by_prior = f @ self.precision @ f + shape @ shape + ((material / MATERIAL_SIGMA) ** 2).sum()
         objective = float(((self.whitening @ residual) ** 2).sum() + by_prior)
-        return Estimate(frame, log_modulus, force, pose, q, residual, shape, objective)
+        return Estimate(frame, material, force, pose, q, residual, shape, objective)
 
-    def minimise(self, force: Array, pose: RigidTransform, start: Array | None, log_modulus: float = 0.0) -> Estimate:
-        """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and modulus."""
-        current = self.evaluate(force, pose, start, log_modulus)
+    def minimise(
+        self, force: Array, pose: RigidTransform, start: Array | None, material: Array = ASSUMED_MATERIAL
+    ) -> Estimate:
+        """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and `Estimate.material`."""
+        current = self.evaluate(force, pose, start, material)
         damping, growth = INITIAL_DAMPING, 2.0  # updated as by H. B. Nielsen
         for _ in range(MAX_ITERATIONS):
             gradient, hessian = self._normal_equations(current)
@@ -170,8 +178,8 @@ class ForceSearch:
         precision, deviation = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
         precision[:count, :count] = self.precision
         deviation[:count] = found.force[self.frame.nodes].ravel() - self.expected
-        if self.with_modulus:
-            precision[-1, -1], deviation[-1] = MODULUS_SIGMA**-2.0, found.log_modulus
+        if self.with_material:
+            precision[-2:, -2:], deviation[-2:] = np.diag(MATERIAL_SIGMA**-2.0), found.material
         by_shape = np.zeros((0, unknowns))
         if np.isfinite(self.prior.shape_sigma):
             by_shape = np.zeros((len(found.shape), unknowns))
@@ -197,7 +205,7 @@ class ForceSearch:
     def marker_sigma(self, found: Estimate) -> Array:
         """Largest standard deviations of the measured markers [m], (M'), in a fit without a pose.
 
-        By Laplace's approximation: the covariance of forces and log E is the inverse of the Gauss-Newton Hessian.
+        By Laplace's approximation: the covariance of forces and material is the inverse of the Gauss-Newton Hessian.
         """
         slopes = self._marker_slopes(found)
         by_unknowns = slopes.reshape(-1, 3, slopes.shape[1])
@@ -206,15 +214,15 @@ class ForceSearch:
         return sigma
 
     def _normal_equations(self, current: Estimate) -> tuple[Array, Array]:
-        """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, the pose (6) or log E."""
+        """Half the gradient and half the Gauss-Newton Hessian by forces (3 L) and, if fitted, pose or material."""
         jacobian = self.whitening @ self._slopes(current)
         gradient, hessian = jacobian.T @ (self.whitening @ current.residual), jacobian.T @ jacobian
         count = len(self.precision)
         gradient[:count] += self.precision @ (current.force[self.frame.nodes].ravel() - self.expected)
         hessian[:count, :count] += self.precision
-        if self.with_modulus:
-            gradient[-1] += current.log_modulus / MODULUS_SIGMA**2
-            hessian[-1, -1] += MODULUS_SIGMA**-2.0
+        if self.with_material:
+            gradient[-2:] += current.material / MATERIAL_SIGMA**2
+            hessian[-2:, -2:] += np.diag(MATERIAL_SIGMA**-2.0)
         if np.isfinite(self.prior.shape_sigma):
             slopes = self._shape_slopes(current)
             own = self._deforming(len(gradient))
@@ -228,7 +236,7 @@ class ForceSearch:
         return np.asarray(np.r_[:count, count + 6 * self.with_pose : unknowns])
 
     def _slopes(self, current: Estimate) -> Array:
-        """Derivatives of the residual by the unknowns: forces and, if fitted, the pose (6) or log E, (3 M', U)."""
+        """Derivatives of the residual by the unknowns: forces and, if fitted, pose (6) or material (2), (3 M', U)."""
         slopes = self._marker_slopes(current)
         if self.with_pose:
             posed = current.pose.apply(self.frame.target[self.frame.measured])
@@ -236,11 +244,11 @@ class ForceSearch:
         return slopes
 
     def _marker_slopes(self, current: Estimate) -> Array:
-        """Derivatives of the measured markers, along their axes, by forces and, if fitted, log E, (3 M', 3 L [+ 1])."""
+        """Derivatives of the measured markers along their axes by forces and material if fitted, (3 M', 3 L [+ 2])."""
         slopes = marker_jacobian(current.frame, current.q)
-        if self.with_modulus:
-            by_modulus = self.frame.along_axes(modulus_slope(current.frame, current.q, current.force))
-            slopes = np.concatenate([slopes, by_modulus.reshape(-1, 1)], axis=1)
+        if self.with_material:
+            by_material = self.frame.along_axes(material_slopes(current.frame, current.q))
+            slopes = np.concatenate([slopes, by_material.reshape(-1, 2)], axis=1)
         return slopes
 
     def _shape(self, q: Array) -> Array:
@@ -253,12 +261,12 @@ class ForceSearch:
         return np.asarray((q[nodes] - rigid.apply(undeformed)).ravel() / self.prior.shape_sigma)
 
     def _shape_slopes(self, current: Estimate) -> Array:
-        """Derivatives of `Estimate.shape` by forces and, if fitted, log E, (3 L, 3 L [+ 1]); small strains assumed."""
+        """Derivatives of `Estimate.shape` by forces and material if fitted, (3 L, 3 L [+ 2]); small strains assumed."""
         nodes, simulator, size = self.frame.nodes, current.frame.simulator, 3 * len(self.frame.nodes)
-        loads = np.zeros((*current.q.shape, size + self.with_modulus))
+        loads = np.zeros((*current.q.shape, size + 2 * self.with_material))
         loads[nodes, :, :size] = np.eye(size).reshape(len(nodes), 3, size)
-        if self.with_modulus:
-            loads[..., -1] = -(simulator.weight + current.force)
+        if self.with_material:
+            loads[..., -2:] = material_loads(simulator, current.q)
         slopes = simulator.solve_tangent(current.q[None], loads[None])[0][nodes].reshape(size, -1)
         rigid, _ = rigid_modes(current.q[nodes])
         return np.asarray((slopes - rigid @ (rigid.T @ slopes)) / self.prior.shape_sigma)
@@ -267,35 +275,46 @@ class ForceSearch:
         """The prior of the forces; for the pose, which has no prior, a small multiple of its Hessian diagonal."""
         matrix, count = np.diag(1e-6 * np.diag(hessian)), len(self.precision)
         matrix[:count, :count] = self.precision
-        if self.with_modulus:
-            matrix[-1, -1] = MODULUS_SIGMA**-2.0
+        if self.with_material:
+            matrix[-2:, -2:] = np.diag(MATERIAL_SIGMA**-2.0)
         return matrix
 
     def _take_step(self, current: Estimate, step: Array) -> Estimate:
         force, count = current.force.copy(), len(self.precision)
         force[self.frame.nodes] += step[:count].reshape(-1, 3)
         pose = current.pose.followed_by(step[count : count + 6]) if self.with_pose else current.pose
-        log_modulus = current.log_modulus + float(step[-1]) if self.with_modulus else current.log_modulus
-        return self.evaluate(force, pose, current.q, log_modulus)
+        material = current.material + step[-2:] if self.with_material else current.material
+        return self.evaluate(force, pose, current.q, material)
 
 
-def _softened(frame: FirstFrame, log_modulus: float) -> FirstFrame:
-    """The frame with another Young's modulus, by the logarithm of its ratio to the assumed one."""
-    if log_modulus == 0.0:
-        return frame
-    material = frame.simulator.material
-    modulus = material.youngs_modulus * float(np.exp(log_modulus))
-    return replace(frame, simulator=frame.simulator.with_material(replace(material, youngs_modulus=modulus)))
+def with_changed_material(simulator: Simulator, change: Array) -> Simulator:
+    """The simulator with log E and log(1/2 - nu) changed (2); nu stays within the bounds of `POISSON`."""
+    if not change.any():
+        return simulator
+    material = simulator.material
+    modulus = material.youngs_modulus * float(np.exp(change[0]))
+    gap = POISSON.variable(material.poissons_ratio)
+    low, high = min(gap, POISSON.bounds[0]), max(gap, POISSON.bounds[1])
+    ratio = POISSON.value(np.clip(gap + change[1], low, high))
+    return simulator.with_material(replace(material, youngs_modulus=modulus, poissons_ratio=float(ratio)))
 
 
-def modulus_slope(frame: FirstFrame, q: Array, force: Array) -> Array:
-    """Derivatives of the measured markers by log E at an equilibrium q (N, 3) under forces (N, 3) [m], (M', 3).
+def material_loads(simulator: Simulator, q: Array) -> Array:
+    """Nodal forces that act as changes of log E and of log(1/2 - nu) do, at node positions q (N, 3) [N], (N, 3, 2).
 
-    The internal forces are proportional to E, and in equilibrium equal to the weight and the virtual forces.
+    The internal forces are proportional to E; by nu, central differences.
     """
-    by_modulus = -frame.simulator.solve_tangent(q[None], (frame.simulator.weight + force)[None])[0]
+    changes = np.array([[0.0, POISSON_STEP], [0.0, -POISSON_STEP]])
+    later, before = (with_changed_material(simulator, change).elastic_gradient(q[None])[0] for change in changes)
+    by_poisson = (later - before) / (2.0 * POISSON_STEP)
+    return -np.stack([simulator.elastic_gradient(q[None])[0], by_poisson], axis=-1)
+
+
+def material_slopes(frame: FirstFrame, q: Array) -> Array:
+    """Derivatives of the measured markers by log E and log(1/2 - nu) at an equilibrium q (N, 3) [m], (M', 3, 2)."""
+    by_material = frame.simulator.solve_tangent(q[None], material_loads(frame.simulator, q)[None])[0]
     corners = frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()
-    slope: Array = np.einsum("micj,mcj->mi", corners, by_modulus[frame.markers.quad])[frame.measured]
+    slope: Array = np.einsum("micj,mcjk->mik", corners, by_material[frame.markers.quad])[frame.measured]
     return slope
 
 

@@ -81,9 +81,9 @@ def fit_first_frame(frame: FirstFrame, pose: RigidTransform | None = None) -> In
     search, found = best.search, best.found
     if not frame.whole_surface and pose is None:
         marker_sigma[frame.measured] = _mixed_sigma(fits, best, error)
-    weight = frame.simulator.weight
-    # With the assumed modulus, the same shape needs forces that are larger by the ratio of the moduli.
-    force = np.exp(-found.log_modulus) * (weight + found.force) - weight
+    # What balances the shape with the assumed material; what the clamp does is no virtual force.
+    force = frame.simulator.elastic_gradient(found.q[None])[0] - frame.simulator.weight
+    force[frame.simulator.fixed] = 0.0
     return InitialState(found.q, force, np.sqrt(3.0) * search.rms(found), found.pose, marker_sigma, search.prior.name)
 
 
@@ -114,8 +114,8 @@ def _fit_surface(frame: FirstFrame, error: MeshError, pose: RigidTransform | Non
 def _fit_tip(frame: FirstFrame, error: MeshError, pose: RigidTransform | None) -> list[_Fit]:
     """The fits of forces on the free end, by what may load it.
 
-    The modulus decides how far the weight bends a body, which no force at the tip makes up for. An unknown pose would:
-    the two can hardly be told apart.
+    The material decides how far and to what shape the weight bends a body, which no force at the tip makes up for. An
+    unknown pose would: the two can hardly be told apart.
     """
     first = ForceSearch(frame, PULL, error.whitening(ASSUMED), pose is not None, pose is None, 0.0)
     found = first.minimise(np.zeros_like(frame.simulator.mesh.vertices), pose or IDENTITY, None)
@@ -147,7 +147,7 @@ def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate, error: MeshEr
     sizes, last = ASSUMED, np.inf
     for _ in range(REFITS):
         search = _search(first, prior, error.whitening(sizes), found)
-        found = search.minimise(found.force, found.pose, found.q, found.log_modulus)
+        found = search.minimise(found.force, found.pose, found.q, found.material)
         fit = _Fit(search, found, sizes, search.log_evidence(found) + error.log_probability(sizes))
         sigma = error.total_sigma(sizes)
         if 1.0 / SETTLED < sigma / last < SETTLED:
@@ -159,7 +159,7 @@ def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate, error: MeshEr
 def _search(first: ForceSearch, prior: ForcePrior, whitening: Array, found: Estimate) -> ForceSearch:
     """The search for the same unknowns under another prior; a weight that hangs is about the one found."""
     pull = _pull(first.frame, found.force)
-    return ForceSearch(first.frame, prior, whitening, first.with_pose, first.with_modulus, pull)
+    return ForceSearch(first.frame, prior, whitening, first.with_pose, first.with_material, pull)
 
 
 def _pull(frame: FirstFrame, force: Array) -> float:

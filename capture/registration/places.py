@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
-from rafl.capture.registration.force_search import MODULUS_SIGMA, modulus_slope
+from rafl.capture.registration.force_search import MODULUS_SIGMA, material_slopes
 from rafl.capture.registration.initial import PULL, ResultantFit, fit_resultant, resultant_jacobian
 from rafl.capture.registration.rigid import RigidTransform
 from rafl.data.markers import Markers, embed
@@ -134,7 +134,7 @@ def _shared_slopes(frame: FirstFrame, fit: ResultantFit, posed: bool) -> Array:
         whole[3 * m : 3 * m + 3, 7 + 3 * m : 10 + 3 * m] = own
     if posed:
         whole[:, 1:7] = -pose_jacobian(frame.target).reshape(-1, 6)
-    whole[rows, 0] = modulus_slope(frame, fit.q, fit.force).ravel()
+    whole[rows, 0] = material_slopes(frame, fit.q)[..., 0].ravel()
     by_axis = frame.along_axes(whole[rows].reshape(-1, 3, whole.shape[1])).reshape(len(rows), -1)
     return np.asarray(fit.whitening @ by_axis)
 
