@@ -36,7 +36,7 @@ from rafl.capture.description.specimen_text import (
     specimen_text,
 )
 from rafl.capture.description.stencil import design_stencil, stencil_pdf
-from rafl.capture.registration.force_search import MODULUS_SIGMA
+from rafl.capture.registration.material_change import MODULUS_SIGMA
 from rafl.capture.registration.registration import RestPose as RestPose
 from rafl.capture.rendering.film import ENCODINGS, render_video, side_cameras, write_board_images, write_truth
 from rafl.capture.rendering.motion import SimulatedMotion, tip_load_release, twist_release

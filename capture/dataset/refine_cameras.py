@@ -15,7 +15,7 @@ from torch import Tensor
 from rafl.capture.dataset.registered import Registered
 from rafl.capture.registration.camera_change import CLOCK, CameraChange
 from rafl.capture.registration.first_frame import FirstFrame
-from rafl.capture.registration.force_search import MODULUS_SIGMA
+from rafl.capture.registration.material_change import MODULUS_SIGMA
 from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError, SimulationError
 from rafl.data.camera_terms import CameraTerm

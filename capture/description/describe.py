@@ -12,7 +12,7 @@ from rafl.capture.description.alignment import HARDLY_TOLD, Alignment, align_wit
 from rafl.capture.description.naming import dots_by_row, faces_of, name_dots
 from rafl.capture.description.still import Dots, dots_at_rest
 from rafl.capture.description.undeformed import PLACED_SIGMA, Shape, Undeformed, carry_back, find_undeformed
-from rafl.capture.registration.force_search import MODULUS_SIGMA
+from rafl.capture.registration.material_change import MODULUS_SIGMA
 from rafl.capture.registration.recording import Recording
 from rafl.capture.registration.rigid import MIN_MARKERS, RigidTransform
 from rafl.capture.specimen.geometry import read_surface

@@ -11,12 +11,8 @@ from numpy.typing import NDArray
 from rafl.capture.description.naming import dots_by_row, faces_of
 from rafl.capture.description.still import Dots
 from rafl.capture.registration.first_frame import MODEL_FRACTION
-from rafl.capture.registration.force_search import MODULUS_SIGMA
-from rafl.capture.registration.places import (
-    MAX_ITERATIONS,
-    MAX_MODULUS_STEP,
-    MIN_MODEL_SIGMA,
-)
+from rafl.capture.registration.material_change import MODULUS_SIGMA
+from rafl.capture.registration.places import MAX_ITERATIONS, MIN_MODEL_SIGMA
 from rafl.data.markers import Markers, embed
 from rafl.fem.mesh import HexMesh
 from rafl.simulation.simulator import GRAVITY, Simulator
@@ -33,6 +29,7 @@ MIN_SIGMA = 5e-5  # of a place, for what the model does not know of the clamp an
 DEPTH_SHARE = 0.3  # standard deviation of an unmeasured depth, as a share of the body's size
 SURFACE_STEPS, LEAST_SLOPE = 8, 0.1  # along a line of sight to a surface, of which it must not be nearly a tangent
 MODULUS_STEP = 0.05  # of log E, for differences
+MAX_MODULUS_STEP = 0.3  # of log E in one iteration
 MODULUS_TOLERANCE = 1e-3  # the search ends with a smaller change of log E
 
 

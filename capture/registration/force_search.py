@@ -8,19 +8,19 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import FirstFrame, rigid_modes
+from rafl.capture.registration.material_change import (
+    MATERIAL_SIGMA,
+    UNCHANGED,
+    material_loads,
+    material_slopes,
+    with_changed_material,
+)
 from rafl.capture.registration.rigid import RigidTransform, kabsch
 from rafl.common.errors import SimulationError
 from rafl.data.views import pose_jacobian
-from rafl.fitting.quantities import POISSON
-from rafl.simulation.simulator import Simulator
 
 Array = NDArray[Any]
 
-MODULUS_SIGMA = 0.5  # prior standard deviation of log E around the assumed material
-# Of the variables of the material, log E and log(1/2 - nu), less those of the assumed material.
-MATERIAL_SIGMA = np.array([MODULUS_SIGMA, POISSON.deviation])
-ASSUMED_MATERIAL = np.zeros(2)
-POISSON_STEP = 1e-3  # of log(1/2 - nu), for the derivatives by it
 LEAST_PULL = 1e-3  # taken for a weight where what is found is less, or upwards [N]
 INITIAL_DAMPING = 1e4  # of a Levenberg-Marquardt step, as a multiple of the prior
 MAX_ITERATIONS, MAX_TRIALS = 100, 6  # of one search, and of one step; the sixth is damped 2^15 times as much
@@ -68,7 +68,7 @@ class Estimate:
 
     Attributes:
         frame: observation, with a simulator of the material that is tried.
-        material: variables of that material, less those of the assumed one, (2): see `with_changed_material`.
+        change: of that material from the assumed one, (3): see `material_change`.
         force: virtual nodal forces [N], (N, 3).
         pose: from the frame of the target to the specimen frame.
         q: node positions in equilibrium [m], (N, 3).
@@ -78,7 +78,7 @@ class Estimate:
     """
 
     frame: FirstFrame
-    material: Array
+    change: Array
     force: Array
     pose: RigidTransform
     q: Array
@@ -96,7 +96,7 @@ class ForceSearch:
         whitening: that turns the markers' residuals into independent numbers of variance one [1/m], (K, 3 M'). A depth
             that no camera observed is an assumption, and the same one for all markers: it has no part in them.
         with_pose: whether the pose is fitted too.
-        with_material: whether Young's modulus and Poisson's ratio are fitted too, around the assumed ones.
+        with_material: whether the material is fitted too, around the assumed one.
         pull: of what hangs on the nodes [N], about, for the prior of a hanging weight.
     """
 
@@ -114,9 +114,9 @@ class ForceSearch:
         self.precision = prior.precision(frame, pull)
         self.expected = frame.expected_force()
 
-    def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, material: Array) -> Estimate:
+    def evaluate(self, force: Array, pose: RigidTransform, start: Array | None, change: Array) -> Estimate:
         """Equilibrium, residual and objective, with the solve started at `start` (N, 3) if given."""
-        frame = replace(self.frame, simulator=with_changed_material(self.frame.simulator, material))
+        frame = replace(self.frame, simulator=with_changed_material(self.frame.simulator, change))
         simulator = frame.simulator
         total, label = (simulator.weight + force)[None], f"{frame.recording}: first frame"
         if start is None:
@@ -128,15 +128,13 @@ class ForceSearch:
         residual = frame.along_axes(positions - pose.apply(frame.target[frame.measured])).ravel()
         shape = self._shape(q)
         f = force[frame.nodes].ravel() - self.expected
-        by_prior = f @ self.precision @ f + shape @ shape + ((material / MATERIAL_SIGMA) ** 2).sum()
+        by_prior = f @ self.precision @ f + shape @ shape + ((change / MATERIAL_SIGMA) ** 2).sum()
         objective = float(((self.whitening @ residual) ** 2).sum() + by_prior)
-        return Estimate(frame, material, force, pose, q, residual, shape, objective)
+        return Estimate(frame, change, force, pose, q, residual, shape, objective)
 
-    def minimise(
-        self, force: Array, pose: RigidTransform, start: Array | None, material: Array = ASSUMED_MATERIAL
-    ) -> Estimate:
-        """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and `Estimate.material`."""
-        current = self.evaluate(force, pose, start, material)
+    def minimise(self, force: Array, pose: RigidTransform, start: Array | None, change: Array = UNCHANGED) -> Estimate:
+        """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and change of the material."""
+        current = self.evaluate(force, pose, start, change)
         damping, growth = INITIAL_DAMPING, 2.0  # updated as by H. B. Nielsen
         for _ in range(MAX_ITERATIONS):
             gradient, hessian = self._normal_equations(current)
@@ -179,7 +177,7 @@ class ForceSearch:
         precision[:count, :count] = self.precision
         deviation[:count] = found.force[self.frame.nodes].ravel() - self.expected
         if self.with_material:
-            precision[-2:, -2:], deviation[-2:] = np.diag(MATERIAL_SIGMA**-2.0), found.material
+            precision[-3:, -3:], deviation[-3:] = np.diag(MATERIAL_SIGMA**-2.0), found.change
         by_shape = np.zeros((0, unknowns))
         if np.isfinite(self.prior.shape_sigma):
             by_shape = np.zeros((len(found.shape), unknowns))
@@ -221,8 +219,8 @@ class ForceSearch:
         gradient[:count] += self.precision @ (current.force[self.frame.nodes].ravel() - self.expected)
         hessian[:count, :count] += self.precision
         if self.with_material:
-            gradient[-2:] += current.material / MATERIAL_SIGMA**2
-            hessian[-2:, -2:] += np.diag(MATERIAL_SIGMA**-2.0)
+            gradient[-3:] += current.change / MATERIAL_SIGMA**2
+            hessian[-3:, -3:] += np.diag(MATERIAL_SIGMA**-2.0)
         if np.isfinite(self.prior.shape_sigma):
             slopes = self._shape_slopes(current)
             own = self._deforming(len(gradient))
@@ -236,7 +234,7 @@ class ForceSearch:
         return np.asarray(np.r_[:count, count + 6 * self.with_pose : unknowns])
 
     def _slopes(self, current: Estimate) -> Array:
-        """Derivatives of the residual by the unknowns: forces and, if fitted, pose (6) or material (2), (3 M', U)."""
+        """Derivatives of the residual by the unknowns: forces and, if fitted, pose (6) or material (3), (3 M', U)."""
         slopes = self._marker_slopes(current)
         if self.with_pose:
             posed = current.pose.apply(self.frame.target[self.frame.measured])
@@ -244,11 +242,11 @@ class ForceSearch:
         return slopes
 
     def _marker_slopes(self, current: Estimate) -> Array:
-        """Derivatives of the measured markers along their axes by forces and material if fitted, (3 M', 3 L [+ 2])."""
+        """Derivatives of the measured markers along their axes by forces and material if fitted, (3 M', 3 L [+ 3])."""
         slopes = marker_jacobian(current.frame, current.q)
         if self.with_material:
-            by_material = self.frame.along_axes(material_slopes(current.frame, current.q))
-            slopes = np.concatenate([slopes, by_material.reshape(-1, 2)], axis=1)
+            by_material = self.frame.along_axes(material_slopes(self.frame, current.change, current.q))
+            slopes = np.concatenate([slopes, by_material.reshape(-1, 3)], axis=1)
         return slopes
 
     def _shape(self, q: Array) -> Array:
@@ -261,12 +259,12 @@ class ForceSearch:
         return np.asarray((q[nodes] - rigid.apply(undeformed)).ravel() / self.prior.shape_sigma)
 
     def _shape_slopes(self, current: Estimate) -> Array:
-        """Derivatives of `Estimate.shape` by forces and material if fitted, (3 L, 3 L [+ 2]); small strains assumed."""
+        """Derivatives of `Estimate.shape` by forces and material if fitted, (3 L, 3 L [+ 3]); small strains assumed."""
         nodes, simulator, size = self.frame.nodes, current.frame.simulator, 3 * len(self.frame.nodes)
-        loads = np.zeros((*current.q.shape, size + 2 * self.with_material))
+        loads = np.zeros((*current.q.shape, size + 3 * self.with_material))
         loads[nodes, :, :size] = np.eye(size).reshape(len(nodes), 3, size)
         if self.with_material:
-            loads[..., -2:] = material_loads(simulator, current.q)
+            loads[..., -3:] = material_loads(self.frame.simulator, current.change, current.q)
         slopes = simulator.solve_tangent(current.q[None], loads[None])[0][nodes].reshape(size, -1)
         rigid, _ = rigid_modes(current.q[nodes])
         return np.asarray((slopes - rigid @ (rigid.T @ slopes)) / self.prior.shape_sigma)
@@ -276,46 +274,15 @@ class ForceSearch:
         matrix, count = np.diag(1e-6 * np.diag(hessian)), len(self.precision)
         matrix[:count, :count] = self.precision
         if self.with_material:
-            matrix[-2:, -2:] = np.diag(MATERIAL_SIGMA**-2.0)
+            matrix[-3:, -3:] = np.diag(MATERIAL_SIGMA**-2.0)
         return matrix
 
     def _take_step(self, current: Estimate, step: Array) -> Estimate:
         force, count = current.force.copy(), len(self.precision)
         force[self.frame.nodes] += step[:count].reshape(-1, 3)
         pose = current.pose.followed_by(step[count : count + 6]) if self.with_pose else current.pose
-        material = current.material + step[-2:] if self.with_material else current.material
-        return self.evaluate(force, pose, current.q, material)
-
-
-def with_changed_material(simulator: Simulator, change: Array) -> Simulator:
-    """The simulator with log E and log(1/2 - nu) changed (2); nu stays within the bounds of `POISSON`."""
-    if not change.any():
-        return simulator
-    material = simulator.material
-    modulus = material.youngs_modulus * float(np.exp(change[0]))
-    gap = POISSON.variable(material.poissons_ratio)
-    low, high = min(gap, POISSON.bounds[0]), max(gap, POISSON.bounds[1])
-    ratio = POISSON.value(np.clip(gap + change[1], low, high))
-    return simulator.with_material(replace(material, youngs_modulus=modulus, poissons_ratio=float(ratio)))
-
-
-def material_loads(simulator: Simulator, q: Array) -> Array:
-    """Nodal forces that act as changes of log E and of log(1/2 - nu) do, at node positions q (N, 3) [N], (N, 3, 2).
-
-    The internal forces are proportional to E; by nu, central differences.
-    """
-    changes = np.array([[0.0, POISSON_STEP], [0.0, -POISSON_STEP]])
-    later, before = (with_changed_material(simulator, change).elastic_gradient(q[None])[0] for change in changes)
-    by_poisson = (later - before) / (2.0 * POISSON_STEP)
-    return -np.stack([simulator.elastic_gradient(q[None])[0], by_poisson], axis=-1)
-
-
-def material_slopes(frame: FirstFrame, q: Array) -> Array:
-    """Derivatives of the measured markers by log E and log(1/2 - nu) at an equilibrium q (N, 3) [m], (M', 3, 2)."""
-    by_material = frame.simulator.solve_tangent(q[None], material_loads(frame.simulator, q)[None])[0]
-    corners = frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()
-    slope: Array = np.einsum("micj,mcjk->mik", corners, by_material[frame.markers.quad])[frame.measured]
-    return slope
+        change = current.change + step[-3:] if self.with_material else current.change
+        return self.evaluate(force, pose, current.q, change)
 
 
 def marker_jacobian(frame: FirstFrame, q: Array) -> Array:

@@ -147,7 +147,7 @@ def _refit(first: ForceSearch, prior: ForcePrior, found: Estimate, error: MeshEr
     sizes, last = ASSUMED, np.inf
     for _ in range(REFITS):
         search = _search(first, prior, error.whitening(sizes), found)
-        found = search.minimise(found.force, found.pose, found.q, found.material)
+        found = search.minimise(found.force, found.pose, found.q, found.change)
         fit = _Fit(search, found, sizes, search.log_evidence(found) + error.log_probability(sizes))
         sigma = error.total_sigma(sizes)
         if 1.0 / SETTLED < sigma / last < SETTLED:

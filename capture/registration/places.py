@@ -8,8 +8,8 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
-from rafl.capture.registration.force_search import MODULUS_SIGMA, material_slopes
 from rafl.capture.registration.initial import PULL, ResultantFit, fit_resultant, resultant_jacobian
+from rafl.capture.registration.material_change import MATERIAL_SIGMA, UNCHANGED, material_slopes, with_changed_material
 from rafl.capture.registration.rigid import RigidTransform
 from rafl.data.markers import Markers, embed
 from rafl.data.views import pose_jacobian
@@ -17,13 +17,14 @@ from rafl.data.views import pose_jacobian
 Array = NDArray[Any]
 
 MIN_PRIOR_SIGMA = 1e-8  # of a place that is exactly known [m]
-MAX_MODULUS_STEP = 0.3  # of log E in one iteration
-MAX_ITERATIONS = 10
+MAX_MATERIAL_STEP = 0.6  # of the change of the material in one iteration [standard deviations of its prior]
+MAX_ITERATIONS = 15
 # The mesh follows no specimen closer than this distance [m], nor than MODEL_FRACTION of its deflection. The error is
 # alike in all recordings, so that more of them do not average it out.
 MIN_MODEL_SIGMA = 1e-5
-# The search ends with a smaller change of every place [m], of log E, and of the pose [rad, m].
-STEP_TOLERANCE, MODULUS_TOLERANCE, POSE_TOLERANCE = 1e-6, 1e-3, 1e-5
+# The search ends with a smaller step of every place [m], of the material [standard deviations of its prior], and of the
+# pose [rad, m].
+STEP_TOLERANCE, MATERIAL_TOLERANCE, POSE_TOLERANCE = 1e-6, 2e-3, 1e-5
 
 
 @dataclass(frozen=True)
@@ -49,10 +50,10 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
     """Places of the markers, and an unknown pose, from the first frames of several recordings of one specimen.
 
     A marker's place is the same in all recordings, and so is the frame of the recordings whose frame is unknown, while
-    forces differ. Gauss-Newton minimises over log E, the pose and the places, and for every recording the virtual
-    force and moment:
+    forces differ. Gauss-Newton minimises over the material (`material_change`), the pose and the places, and for
+    every recording the virtual force and moment:
 
-        sum |x - target|^2 / (sigma^2 + R model_sigma^2) + sum |moved|^2 / prior_sigma^2 + the forces' prior + E's prior
+        sum |x - target|^2 / (sigma^2 + R model_sigma^2) + sum |moved|^2 / prior_sigma^2 + priors of forces and material
 
     with R recordings, and a model_sigma of each that follows from its deflection (`MODEL_FRACTION`). The forces are
     eliminated recording by recording. Where markers of one side only are seen, they may be those of a hanging weight
@@ -69,7 +70,7 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
         SimulationError: an equilibrium could not be found.
     """
     layout, simulator = frames[0].markers, frames[0].simulator
-    count, log_modulus, markers = len(layout.names), 0.0, layout
+    count, change, markers = len(layout.names), UNCHANGED, layout
     moved = np.zeros((count, 3))
     fits: list[ResultantFit | None] = [None] * len(frames)
     priors = [PULL] * len(frames)
@@ -78,19 +79,21 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
     by_place = np.repeat(np.maximum(prior_sigma, MIN_PRIOR_SIGMA) ** -2.0, 3)
     # A pose that no frame depends on stays as it is.
     by_pose = np.zeros(6) if any(unknown) else np.ones(6)
-    precision = np.concatenate([[MODULUS_SIGMA**-2.0], by_pose, by_place])
+    precision = np.concatenate([MATERIAL_SIGMA**-2.0, by_pose, by_place])
+    material_part, pose_part, place_part = slice(0, 3), slice(3, 9), slice(9, None)
     for _ in range(MAX_ITERATIONS):
-        modulus = simulator.material.youngs_modulus * np.exp(log_modulus)
-        softened = simulator.with_material(replace(simulator.material, youngs_modulus=modulus))
+        changed = with_changed_material(simulator, change)
         hessian, chosen = np.diag(precision), []
-        gradient = precision * np.concatenate([[log_modulus], np.zeros(6), moved.ravel()])
+        gradient = precision * np.concatenate([change, np.zeros(6), moved.ravel()])
         for k, frame in enumerate(frames):
-            current = replace(frame, simulator=softened, markers=markers)
+            current = replace(frame, simulator=changed, markers=markers)
             if unknown[k]:
                 current = replace(current, target=pose.apply(frame.target))
             fit = fit_resultant(current, model_sigma[k], fits[k], priors[k])
             fits[k] = fit
-            shared = _shared_slopes(current, fit, unknown[k])
+            shared = _shared_slopes(
+                current, fit, unknown[k], material_slopes(replace(current, simulator=simulator), change, fit.q)
+            )
             own_hessian, own_gradient = _reduced_normal_equations(current, fit, shared)
             hessian += own_hessian
             gradient += own_gradient
@@ -101,21 +104,22 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
             model_sigma[k] = float(np.sqrt(len(frames))) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
         covariance = _inverse(hessian)
         step = -covariance @ gradient
-        step *= min(1.0, MAX_MODULUS_STEP / max(abs(step[0]), MAX_MODULUS_STEP))
-        log_modulus += float(step[0])
-        pose = pose.followed_by(step[1:7])
-        moved = moved + step[7:].reshape(-1, 3)
+        longest_step = float(np.abs(step[material_part] / MATERIAL_SIGMA).max())
+        step *= min(1.0, MAX_MATERIAL_STEP / max(longest_step, MAX_MATERIAL_STEP))
+        change = change + step[material_part]
+        pose = pose.followed_by(step[pose_part])
+        moved = moved + step[place_part].reshape(-1, 3)
         markers = embed(simulator.mesh, layout.names, layout.rest + moved)
         tolerance = np.concatenate(
-            [[MODULUS_TOLERANCE], np.full(6, POSE_TOLERANCE), np.full(3 * count, STEP_TOLERANCE)]
+            [MATERIAL_TOLERANCE * MATERIAL_SIGMA, np.full(6, POSE_TOLERANCE), np.full(3 * count, STEP_TOLERANCE)]
         )
         if (np.abs(step) < tolerance).all() and chosen == priors:
             break
         priors = chosen
     sigma = np.sqrt(np.diag(covariance))
-    markers = replace(markers, moved=moved, place_sigma=sigma[7:].reshape(-1, 3))
-    modulus = simulator.material.youngs_modulus * np.exp(log_modulus)
-    return Places(markers, pose, covariance[1:7, 1:7], modulus, float(sigma[0]))
+    markers = replace(markers, moved=moved, place_sigma=sigma[place_part].reshape(-1, 3))
+    modulus = simulator.material.youngs_modulus * float(np.exp(change[0]))
+    return Places(markers, pose, covariance[pose_part, pose_part], modulus, float(sigma[0]))
 
 
 def _inverse(hessian: Array) -> Array:
@@ -124,23 +128,26 @@ def _inverse(hessian: Array) -> Array:
     return np.asarray(scale[:, None] * np.linalg.inv(scale[:, None] * hessian * scale) * scale)
 
 
-def _shared_slopes(frame: FirstFrame, fit: ResultantFit, posed: bool) -> Array:
-    """Derivatives of a recording's whitened residuals by (log E, pose, places), (K, 7 + 3 M)."""
+def _shared_slopes(frame: FirstFrame, fit: ResultantFit, posed: bool, by_material: Array) -> Array:
+    """Derivatives of a recording's whitened residuals by (material, pose, places), (K, 9 + 3 M).
+
+    by_material: derivatives of the measured markers by the material [m], (M', 3, 3).
+    """
     rows = np.flatnonzero(np.repeat(frame.measured, 3))
-    whole = np.zeros((3 * len(frame.target), 7 + 3 * len(frame.target)))
+    whole = np.zeros((3 * len(frame.target), 9 + 3 * len(frame.target)))
     q = torch.from_numpy(fit.q)
     by_place = frame.markers.place_slope(q, torch.from_numpy(frame.simulator.mesh.vertices))
     for m, own in enumerate(by_place.numpy()):
-        whole[3 * m : 3 * m + 3, 7 + 3 * m : 10 + 3 * m] = own
+        whole[3 * m : 3 * m + 3, 9 + 3 * m : 12 + 3 * m] = own
     if posed:
-        whole[:, 1:7] = -pose_jacobian(frame.target).reshape(-1, 6)
-    whole[rows, 0] = material_slopes(frame, fit.q)[..., 0].ravel()
+        whole[:, 3:9] = -pose_jacobian(frame.target).reshape(-1, 6)
+    whole[rows, :3] = by_material.reshape(-1, 3)
     by_axis = frame.along_axes(whole[rows].reshape(-1, 3, whole.shape[1])).reshape(len(rows), -1)
     return np.asarray(fit.whitening @ by_axis)
 
 
 def _reduced_normal_equations(frame: FirstFrame, fit: ResultantFit, slopes: Array) -> tuple[Array, Array]:
-    """Half the Hessian and half the gradient of one recording's part by (log E, pose, places), less its forces.
+    """Half the Hessian and half the gradient of one recording's part by (material, pose, places), less its forces.
 
     slopes: `_shared_slopes` of the recording.
     """

@@ -20,7 +20,7 @@ from rafl.capture.description.specimen_files import (
     uncertain_sag,
 )
 from rafl.capture.description.specimen_text import body_of_box, specimen_name
-from rafl.capture.registration.force_search import MODULUS_SIGMA
+from rafl.capture.registration.material_change import MODULUS_SIGMA
 from rafl.capture.specimen.specimen import Body, SpecimenFile
 from rafl.common.errors import InputError, SimulationError
 from rafl.common.files import written_files

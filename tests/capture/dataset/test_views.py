@@ -87,7 +87,7 @@ def test_first_frame_does_not_depend_on_the_assumed_depth(front: Specimen, motio
     assert distance < 4e-5  # out of the image plane nothing but the shape tells the position, and that a weight hung
     sigma = np.asarray(found[0].attributes["fit_sigma_mm"])
     assert sigma.shape == (len(front.layout.names),)
-    assert 0.01 < sigma.max() < 0.1
+    assert 0.01 < sigma.max() < 0.2  # most of it for nu, as elements lock here
     assert 1e3 * distance < 3.0 * sigma.max()
 
 

@@ -100,7 +100,7 @@ def test_places_from_one_camera_move_no_first_frame_sideways(front: Specimen) ->
         found = fit_first_frame(replace(frame, markers=markers))
         assert found.loading == "hanging weight"
         depth = (markers.positions(torch.from_numpy(found.q)).numpy() - true.target)[:, 1]
-        assert np.abs(depth).max() < 0.1e-3
+        assert np.abs(depth).max() < 0.15e-3
 
 
 def test_places_are_found_in_an_unknown_frame(small_specimen: Specimen) -> None:
