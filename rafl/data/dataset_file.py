@@ -2,6 +2,7 @@
 
 import datetime
 import hashlib
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -239,10 +240,10 @@ def read_dataset(path: str | Path) -> Dataset:
 
 
 def read_datasets(paths: list[Path]) -> list[Dataset]:
-    """Read and check several dataset files.
+    """Read and check several dataset files. Those of one specimen are named after their files, to tell them apart.
 
     Raises:
-        InputError: two hold the same, or as `read_dataset` says.
+        InputError: two hold the same, or have the same file name too, or as `read_dataset` says.
     """
     datasets = [read_dataset(path) for path in paths]
     if copies := find_copies(paths):
@@ -250,6 +251,14 @@ def read_datasets(paths: list[Path]) -> list[Dataset]:
             f"expected each dataset once, found {copies[0]} in {copies[1]} again, whose recordings would count twice; "
             "name one of them"
         )
+    count = Counter(dataset.name for dataset in datasets)
+    datasets = [
+        replace(dataset, name=path.stem) if count[dataset.name] > 1 else dataset
+        for path, dataset in zip(paths, datasets, strict=True)
+    ]
+    name, number = Counter(dataset.name for dataset in datasets).most_common(1)[0]
+    if number > 1:
+        raise InputError(f"expected datasets of different names, found {name} {number} times; rename their files")
     return datasets
 
 
