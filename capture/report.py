@@ -5,7 +5,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from rafl.capture.dataset.camera_summary import CAMERA_HEADINGS, camera_rows
-from rafl.capture.dataset.summary import VALID, largest_sigma, warnings
+from rafl.capture.dataset.summary import VALID, largest_sigma, load_text, warnings
 from rafl.capture.specimen.specimen import Specimen
 from rafl.data.dataset import Dataset
 from rafl.data.markers import Markers
@@ -124,7 +124,7 @@ def _row(name: str, dataset: Dataset) -> list[object]:
     return [
         name,
         item.split,
-        f"{values['load_g']:g} {values['load']}",
+        load_text(values),
         len(item.time),
         f"{item.valid.mean():.1%}",
         values["first_frame"],

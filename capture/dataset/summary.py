@@ -1,5 +1,6 @@
 """Text summary of a dataset: a table of recordings, warnings, and the contents of the file."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ def recordings_table(dataset: Dataset) -> Table:
         table.add_row(
             name,
             item.split,
-            f"{_number(values.get('load_g'), 'g')} {values.get('load', '')}",
+            load_text(values),
             str(len(item.time)),
             f"{item.valid.mean():.1%}",
             first_frame,
@@ -51,6 +52,12 @@ def recordings_table(dataset: Dataset) -> Table:
             _number(largest_sigma(values), ".2g"),
         )
     return table
+
+
+def load_text(values: Mapping[str, object]) -> str:
+    """The load of a recording in words, from its attributes."""
+    load = values.get("load_g")
+    return "none" if load == 0.0 else f"{_number(load, 'g')} {values.get('load', '')}"
 
 
 def cameras_table(dataset: Dataset) -> Table | None:
