@@ -23,9 +23,6 @@ SURFACE_PRIOR = ForcePrior("forces on the whole surface", 0.3)  # if forces act 
 # Of the body's own weight. Where E is too small by its prior's sigma, a beam on which nothing hangs seems to be pushed
 # up at its tip by 3/8 (1 - exp(-0.5)) of it.
 UPWARD_SHARE = 0.15
-# Spread of markers on one plane across it, relative to that along it. Places half a millimetre off on a face of 100 mm
-# make it 0.02; two sides of a beam a fifth as wide as long, 0.3.
-FLAT = 0.05
 REFITS = 5  # at most, with the error of the mesh that the last fit makes most probable
 SETTLED = 1.2  # ratio of standard deviations of the markers in successive fits; a smaller one ends the refits
 FORCE_CHANGE = LOCAL[0]  # prior of the forces whose change gives the velocity of a body in motion
@@ -173,16 +170,6 @@ def _may_hang(frame: FirstFrame, force: Array) -> bool:
     return _pull(frame, force) > -UPWARD_SHARE * _pull(frame, frame.simulator.weight)
 
 
-def _sees_one_side(frame: FirstFrame) -> bool:
-    """Whether the measured markers are on one plane and not all measured in all directions.
-
-    Markers of both sides tell a bend towards the camera from a stretch; those of one side do not.
-    """
-    rest = frame.markers.rest[frame.measured]
-    spread = np.linalg.svd(rest - rest.mean(axis=0), compute_uv=False)
-    return bool(spread[-1] < FLAT * spread[0] and not frame.observed_axes.all())
-
-
 @dataclass(frozen=True)
 class ResultantFit:
     """A fit of the first frame by a force and a moment on the nodes.
@@ -206,12 +193,12 @@ class ResultantFit:
     prior: ForcePrior
 
     def most_probable_prior(self, frame: FirstFrame, shared: Array) -> ForcePrior:
-        """A hanging weight or any force, whichever is more probable near this fit where one side of the body is seen.
+        """A hanging weight or any force, whichever is more probable near this fit.
 
         shared: whitened derivatives of the residuals by numbers of mean zero and variance one that all first frames
             have in common, (K, S).
         """
-        if not (_may_hang(frame, self.force) and _sees_one_side(frame)):
+        if not _may_hang(frame, self.force):
             return PULL
         pull = _pull(frame, self.force)
         residual = self.whitening @ self.residual - self.jacobian @ self.amplitude

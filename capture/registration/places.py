@@ -56,8 +56,8 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
         sum |x - target|^2 / (sigma^2 + R model_sigma^2) + sum |moved|^2 / prior_sigma^2 + priors of forces and material
 
     with R recordings, and a model_sigma of each that follows from its deflection (`MODEL_FRACTION`). The forces are
-    eliminated recording by recording. Where markers of one side only are seen, they may be those of a hanging weight
-    (`ResultantFit.most_probable_prior`): sideways forces that nobody exerted would move the places. A pose and an
+    eliminated recording by recording. They may be those of a hanging weight (`ResultantFit.most_probable_prior`):
+    sideways forces that nobody exerted would move the places. A pose and an
     unknown force can hardly be told apart, nor then can E; known loads decide (`FirstFrame.load`).
 
     Args:
