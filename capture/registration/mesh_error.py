@@ -17,11 +17,8 @@ from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
 
 Array = NDArray[Any]
 
-# Of the smooth error, as a share of the specimen's largest extent. The markers hardly tell it, but sigmas depend on it:
-# over 40 first frames of beams of three laws and three shapes (tests/bench/unlike_material.py), errors over sigma are
-# 1.80, 1.05 and 0.79 with one camera for 0.25, 0.35 and 0.45, and 1.28, 1.06 and 0.96 with two. Still 0.25
-# is nearest to the shapes: with 0.35, first frames of the demonstration are up to 1.1 mm off their markers, and its
-# model is 0.035 mm off instead of 0.010 mm.
+# Of the smooth error, as a share of the specimen's largest extent. Over 40 first frames of beams of three laws and
+# three shapes (tests/bench/unlike_material.py), errors over sigma are 0.85 with one camera and 1.14 with two.
 CORRELATION_LENGTH = 0.25
 SIZE_SIGMA = np.log(10.0)  # of the logarithm of a size around the assumed one: a factor of ten is no surprise
 LEAST_FACTOR = 1e-6  # of a size from which a search starts, relative to the assumed one
