@@ -35,7 +35,7 @@ class InitialState:
 
     Attributes:
         q: node positions [m], (N, 3).
-        force: virtual nodal forces, without gravity [N], (N, 3).
+        force: nodal forces that balance the body with the assumed material, without gravity and the clamp [N], (N, 3).
         residual: root mean square distance between the markers and those of the mesh in equilibrium, over the observed
             axes [m].
         pose: from the frame of the target to the specimen frame; the identity if it was not fitted.

@@ -57,8 +57,8 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
 
     with R recordings, and a model_sigma of each that follows from its deflection (`MODEL_FRACTION`). The forces are
     eliminated recording by recording. They may be those of a hanging weight (`ResultantFit.most_probable_prior`):
-    sideways forces that nobody exerted would move the places. A pose and an
-    unknown force can hardly be told apart, nor then can E; known loads decide (`FirstFrame.load`).
+    sideways forces that nobody exerted would move the places. A pose and an unknown force can hardly be told apart, nor
+    then can E; known loads decide (`FirstFrame.load`).
 
     Args:
         frames: observations, with the markers embedded at their places in the layout.
@@ -91,9 +91,8 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
                 current = replace(current, target=pose.apply(frame.target))
             fit = fit_resultant(current, model_sigma[k], fits[k], priors[k])
             fits[k] = fit
-            shared = _shared_slopes(
-                current, fit, unknown[k], material_slopes(replace(current, simulator=simulator), change, fit.q)
-            )
+            by_material = material_slopes(replace(current, simulator=simulator), change, fit.q)
+            shared = _shared_slopes(current, fit, unknown[k], by_material)
             own_hessian, own_gradient = _reduced_normal_equations(current, fit, shared)
             hessian += own_hessian
             gradient += own_gradient
