@@ -18,7 +18,7 @@ from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
 Array = NDArray[Any]
 
 # Of the smooth error, as a share of the specimen's largest extent. Over 40 first frames of beams of three laws and
-# three shapes (tests/bench/unlike_material.py), errors over sigma are 0.85 with one camera and 1.14 with two.
+# three shapes (tests/bench/unlike_material.py), errors over sigma are 0.95 with one camera and 1.11 with two.
 CORRELATION_LENGTH = 0.25
 SIZE_SIGMA = np.log(10.0)  # of the logarithm of a size around the assumed one: a factor of ten is no surprise
 LEAST_FACTOR = 1e-6  # of a size from which a search starts, relative to the assumed one
