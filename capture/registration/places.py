@@ -103,8 +103,8 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
             model_sigma[k] = float(np.sqrt(len(frames))) * max(MODEL_FRACTION * size, MIN_MODEL_SIGMA)
         covariance = _inverse(hessian)
         step = -covariance @ gradient
-        longest_step = float(np.abs(step[material_part] / MATERIAL_SIGMA).max())
-        step *= min(1.0, MAX_MATERIAL_STEP / max(longest_step, MAX_MATERIAL_STEP))
+        largest = float(np.abs(step[material_part] / MATERIAL_SIGMA).max())
+        step *= min(1.0, MAX_MATERIAL_STEP / max(largest, MAX_MATERIAL_STEP))
         change = change + step[material_part]
         pose = pose.followed_by(step[pose_part])
         moved = moved + step[place_part].reshape(-1, 3)
