@@ -12,7 +12,6 @@ from rafl.capture.registration.material_change import (
     MATERIAL_SIGMA,
     UNCHANGED,
     material_loads,
-    material_slopes,
     with_changed_material,
 )
 from rafl.capture.registration.rigid import RigidTransform, kabsch
@@ -24,6 +23,8 @@ Array = NDArray[Any]
 LEAST_PULL = 1e-3  # taken for a weight where what is found is less, or upwards [N]
 INITIAL_DAMPING = 1e4  # of a Levenberg-Marquardt step, as a multiple of the prior
 MAX_ITERATIONS, MAX_TRIALS = 100, 6  # of one search, and of one step; the sixth is damped 2^15 times as much
+# Of Newton's method from one equilibrium to the next. Those that a search keeps take fewer than ten.
+MAX_NEWTON_ITERATIONS = 30
 # The search ends where an undamped step promises a smaller decrease: relative to the objective, plus absolute.
 RELATIVE_TOLERANCE, ABSOLUTE_TOLERANCE = 1e-4, 1e-3
 
@@ -122,8 +123,10 @@ class ForceSearch:
         if start is None:
             q = simulator.equilibrium(total, label=label)[0]
         else:  # `minimise` fails at once where `equilibrium` would increase the load in small steps
-            zero = np.zeros(total.shape[:2])
-            q = simulator.minimise(start[None], zero, start[None], total, simulator.constitutive_state(1), label)[0]
+            zero, state = np.zeros(total.shape[:2]), simulator.constitutive_state(1)
+            q = simulator.minimise(
+                start[None], zero, start[None], total, state, label, max_iterations=MAX_NEWTON_ITERATIONS
+            )[0]
         positions = frame.markers.positions(torch.from_numpy(q)).numpy()[frame.measured]
         residual = frame.along_axes(positions - pose.apply(frame.target[frame.measured])).ravel()
         shape = self._shape(q)
@@ -243,10 +246,11 @@ class ForceSearch:
 
     def _marker_slopes(self, current: Estimate) -> Array:
         """Derivatives of the measured markers along their axes by forces and material if fitted, (3 M', 3 L [+ 3])."""
-        slopes = marker_jacobian(current.frame, current.q)
+        by_force = node_force_slopes(current.frame, current.q)
+        slopes = by_force[:, self.frame.nodes].reshape(len(by_force), -1)
         if self.with_material:
-            by_material = self.frame.along_axes(material_slopes(self.frame, current.change, current.q))
-            slopes = np.concatenate([slopes, by_material.reshape(-1, 3)], axis=1)
+            loads = material_loads(self.frame.simulator, current.change, current.q)
+            slopes = np.concatenate([slopes, np.tensordot(by_force, loads)], axis=1)
         return slopes
 
     def _shape(self, q: Array) -> Array:
@@ -285,8 +289,8 @@ class ForceSearch:
         return self.evaluate(force, pose, current.q, change)
 
 
-def marker_jacobian(frame: FirstFrame, q: Array) -> Array:
-    """Derivatives of the measured markers, along their axes, by the forces on the nodes [m/N], (3 M', 3 L).
+def node_force_slopes(frame: FirstFrame, q: Array) -> Array:
+    """Derivatives of the measured markers, along their axes, by forces on all nodes [m/N], (3 M', N, 3).
 
     q: equilibrium [m], (N, 3).
     """
@@ -296,5 +300,4 @@ def marker_jacobian(frame: FirstFrame, q: Array) -> Array:
     for corner in range(4):
         rows[np.arange(len(measured)), :, frame.markers.quad[measured, corner]] += by_corner[:, :, corner]
     solved = frame.simulator.solve_tangent(q[None], np.moveaxis(rows.reshape(-1, *q.shape), 0, -1)[None])[0]
-    jacobian: Array = np.moveaxis(solved[frame.nodes], -1, 0).reshape(3 * len(measured), -1)
-    return jacobian
+    return np.moveaxis(solved, -1, 0)  # the tangent is symmetric

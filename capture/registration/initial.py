@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import FirstFrame
-from rafl.capture.registration.force_search import Estimate, ForcePrior, ForceSearch, marker_jacobian
+from rafl.capture.registration.force_search import Estimate, ForcePrior, ForceSearch, node_force_slopes
 from rafl.capture.registration.mesh_error import ASSUMED, EXACT, ErrorSizes, MeshError
 from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 
@@ -178,6 +178,7 @@ class ResultantFit:
         force: virtual nodal forces [N], (N, 3).
         q: node positions [m], (N, 3).
         residual: markers of the mesh minus measured markers along their axes [m], (3 M').
+        by_force: derivatives of the measured markers, along their axes, by forces on all nodes [m/N], (3 M', N, 3).
         whitening: of the residuals in the objective [1/m], (K, 3 M').
         jacobian: derivatives of the whitened residuals by the amplitudes of the n modes [1/N], (K, n).
         amplitude: of the modes, less their expected values [N], (n).
@@ -187,6 +188,7 @@ class ResultantFit:
     force: Array
     q: Array
     residual: Array
+    by_force: Array
     whitening: Array
     jacobian: Array
     amplitude: Array
@@ -236,9 +238,10 @@ def fit_resultant(
     search = ForceSearch(frame, prior, np.diag(weight), False, False, _pull(frame, force))
     found = search.minimise(force, IDENTITY, start.q if start else None)
     modes, _ = frame.resultant_modes()
-    jacobian = search.whitening @ marker_jacobian(frame, found.q) @ modes
+    by_force = node_force_slopes(frame, found.q)
+    jacobian = search.whitening @ by_force[:, frame.nodes].reshape(len(by_force), -1) @ modes
     amplitude = modes.T @ (found.force[frame.nodes].ravel() - frame.expected_force())
-    return ResultantFit(found.force, found.q, found.residual, search.whitening, jacobian, amplitude, prior)
+    return ResultantFit(found.force, found.q, found.residual, by_force, search.whitening, jacobian, amplitude, prior)
 
 
 def resultant_jacobian(frame: FirstFrame, fit: ResultantFit) -> tuple[Array, Array]:
@@ -260,7 +263,8 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
         q: the mesh in the first frame [m], (N, 3).
         velocity, sigma: velocities of the markers and their sigmas [m/s], (M, 3); NaN and infinite if unknown.
     """
-    jacobian = marker_jacobian(frame, q)
+    jacobian = node_force_slopes(frame, q)[:, frame.nodes]
+    jacobian = jacobian.reshape(len(jacobian), -1)
     velocity = frame.along_axes(np.where(np.isfinite(velocity), velocity, 0.0)[frame.measured]).ravel()
     if frame.axes is not None:
         sigma = np.where(np.isfinite(frame.sigma), np.sqrt((frame.axes**2 @ sigma[..., None] ** 2)[..., 0]), np.inf)

@@ -9,11 +9,10 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from rafl.capture.registration.first_frame import FirstFrame
 from rafl.fem.learned.energy import KINDS, MIN_LAW_SHARE, SCALES, UNITS
+from rafl.fem.material import Material
 from rafl.fitting.quantities import POISSON
 from rafl.simulation.simulator import Simulator
 
@@ -37,17 +36,27 @@ def with_changed_material(assumed: Simulator, change: Array) -> Simulator:
     """The simulator of a changed material (3); nu and the weight stay within their bounds."""
     if not change.any():
         return assumed
-    material = assumed.material
-    modulus = material.youngs_modulus * float(np.exp(change[0]))
-    gap = POISSON.variable(material.poissons_ratio)
-    low, high = POISSON.bounds
-    ratio = float(POISSON.value(np.clip(gap + change[1], min(gap, low), max(gap, high))))
-    weights = np.zeros(UNITS) if not material.energy_weights else np.array(material.energy_weights)
-    weight = float(np.clip(change[2], MIN_LAW_SHARE - 1.0, 1.0 - MIN_LAW_SHARE))
-    weights[TENSION_UNIT if weight > 0.0 else COMPRESSION_UNIT] += abs(weight)
+    modulus, ratio, weights = _changed_values(assumed.material, change)
     learned = tuple(weights.tolist()) if weights.any() else ()
-    changed = replace(material, youngs_modulus=modulus, poissons_ratio=ratio, energy_weights=learned)
+    changed = replace(
+        assumed.material, youngs_modulus=float(modulus), poissons_ratio=float(ratio), energy_weights=learned
+    )
     return assumed.with_material(changed)
+
+
+def _changed_values(assumed: Material, change: Array) -> tuple[Array, Array, Array]:
+    """Young's moduli [Pa], (..), Poisson's ratios, (..), and weights, (.., UNITS), of changes (.., 3) of a material."""
+    modulus = assumed.youngs_modulus * np.exp(change[..., 0])
+    gap = POISSON.variable(assumed.poissons_ratio)
+    low, high = POISSON.bounds
+    ratio = POISSON.value(np.clip(gap + change[..., 1], min(gap, low), max(gap, high)))
+    weights = np.zeros((*change.shape[:-1], UNITS))
+    if assumed.energy_weights:
+        weights += assumed.energy_weights
+    largest = 1.0 - MIN_LAW_SHARE
+    weights[..., TENSION_UNIT] += np.clip(change[..., 2], 0.0, largest)
+    weights[..., COMPRESSION_UNIT] += np.clip(-change[..., 2], 0.0, largest)
+    return modulus, ratio, weights
 
 
 def material_loads(assumed: Simulator, change: Array, q: Array) -> Array:
@@ -55,25 +64,10 @@ def material_loads(assumed: Simulator, change: Array, q: Array) -> Array:
 
     By central differences of the internal forces.
     """
-    columns = []
-    for step in DIFFERENCE * np.eye(len(change)):
-        later, before = (
-            with_changed_material(assumed, x).elastic_gradient(q[None])[0] for x in (change + step, change - step)
-        )
-        columns.append((before - later) / (2.0 * DIFFERENCE))
-    return np.stack(columns, axis=-1)
-
-
-def material_slopes(frame: FirstFrame, change: Array, q: Array) -> Array:
-    """Derivatives of the measured markers by the change of the material [m], (M', 3, 3).
-
-    Args:
-        frame: observation, with the assumed material.
-        change: of the material.
-        q: equilibrium with the changed material [m], (N, 3).
-    """
-    simulator = with_changed_material(frame.simulator, change)
-    by_change = simulator.solve_tangent(q[None], material_loads(frame.simulator, change, q)[None])[0]
-    corners = frame.markers.corner_jacobian(torch.from_numpy(q)).numpy()
-    slopes: Array = np.einsum("micj,mcjk->mik", corners, by_change[frame.markers.quad])[frame.measured]
-    return slopes
+    steps = DIFFERENCE * np.eye(len(change))
+    modulus, ratio, weights = _changed_values(assumed.material, change + np.concatenate([-steps, steps]))
+    tried = assumed.parameters(youngs_modulus=modulus, poissons_ratio=ratio, energy_weights=weights)
+    gradient = assumed.elastic_gradient(np.repeat(q[None], 2 * len(change), axis=0), tried)
+    before, later = np.split(gradient, 2)
+    loads: Array = np.moveaxis(before - later, 0, -1) / (2.0 * DIFFERENCE)
+    return loads

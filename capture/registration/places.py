@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import MODEL_FRACTION, FirstFrame
 from rafl.capture.registration.initial import PULL, ResultantFit, fit_resultant, resultant_jacobian
-from rafl.capture.registration.material_change import MATERIAL_SIGMA, UNCHANGED, material_slopes, with_changed_material
+from rafl.capture.registration.material_change import MATERIAL_SIGMA, UNCHANGED, material_loads, with_changed_material
 from rafl.capture.registration.rigid import RigidTransform
 from rafl.data.markers import Markers, embed
 from rafl.data.views import pose_jacobian
@@ -91,7 +91,7 @@ def find_places(frames: list[FirstFrame], unknown: list[bool], pose: RigidTransf
                 current = replace(current, target=pose.apply(frame.target))
             fit = fit_resultant(current, model_sigma[k], fits[k], priors[k])
             fits[k] = fit
-            by_material = material_slopes(replace(current, simulator=simulator), change, fit.q)
+            by_material = np.tensordot(fit.by_force, material_loads(simulator, change, fit.q))
             shared = _shared_slopes(current, fit, unknown[k], by_material)
             own_hessian, own_gradient = _reduced_normal_equations(current, fit, shared)
             hessian += own_hessian
@@ -130,7 +130,7 @@ def _inverse(hessian: Array) -> Array:
 def _shared_slopes(frame: FirstFrame, fit: ResultantFit, posed: bool, by_material: Array) -> Array:
     """Derivatives of a recording's whitened residuals by (material, pose, places), (K, 9 + 3 M).
 
-    by_material: derivatives of the measured markers by the material [m], (M', 3, 3).
+    by_material: derivatives of the measured markers, along their axes, by the material [m], (3 M', 3).
     """
     rows = np.flatnonzero(np.repeat(frame.measured, 3))
     whole = np.zeros((3 * len(frame.target), 9 + 3 * len(frame.target)))
@@ -140,8 +140,8 @@ def _shared_slopes(frame: FirstFrame, fit: ResultantFit, posed: bool, by_materia
         whole[3 * m : 3 * m + 3, 9 + 3 * m : 12 + 3 * m] = own
     if posed:
         whole[:, 3:9] = -pose_jacobian(frame.target).reshape(-1, 6)
-    whole[rows, :3] = by_material.reshape(-1, 3)
     by_axis = frame.along_axes(whole[rows].reshape(-1, 3, whole.shape[1])).reshape(len(rows), -1)
+    by_axis[:, :3] = by_material
     return np.asarray(fit.whitening @ by_axis)
 
 

@@ -31,6 +31,7 @@ def minimise(
     state: ConstitutiveState,
     label: str = "step",
     factors: Factors | None = None,
+    max_iterations: int = MAX_ITERATIONS,
 ) -> Array:
     """Positions minimising sum inertia/2 |q - target|^2 - force . q + energy of the body.
 
@@ -48,6 +49,7 @@ def minimise(
         state: moduli and damping history of each trajectory.
         label: name of the solve in error messages.
         factors: those of the previous step; reused and replaced.
+        max_iterations: of a search; a second one without a limit on the step follows the first.
 
     Returns:
         Positions [m], (B, N, 3).
@@ -55,7 +57,17 @@ def minimise(
     Raises:
         SimulationError: no convergence; names trajectory, residual and remedies.
     """
-    problem = (engine, start, inertia, target, force, state, label, factors or engine.allocate(len(start)))
+    problem = (
+        engine,
+        start,
+        inertia,
+        target,
+        force,
+        state,
+        label,
+        factors or engine.allocate(len(start)),
+        max_iterations,
+    )
     try:
         found = _minimise(*problem, MAX_STEP_EDGE_CHANGE)
     except SimulationError:
@@ -81,6 +93,7 @@ def _minimise(
     state: ConstitutiveState,
     label: str,
     factors: Factors,
+    max_iterations: int,
     max_change: float,
 ) -> Array:
     """`minimise` with steps that change no edge by more than `max_change` times its rest length."""
@@ -101,7 +114,7 @@ def _minimise(
         return engine.evaluate(at.reshape(-1, *shape), own, tangent=False)[:2]
 
     evaluate_start(q, *elastic(np.arange(batch), q), *loads, energy, residual, largest)
-    for _ in range(MAX_ITERATIONS):
+    for _ in range(max_iterations):
         running = np.flatnonzero(~(largest <= tolerance))
         if not len(running):
             return q.reshape(start.shape)

@@ -16,7 +16,7 @@ from rafl.fem.mesh import HexMesh
 from rafl.simulation.compiled_engine import CompiledEngine
 from rafl.simulation.device import CPU, require_device
 from rafl.simulation.engine import Engine
-from rafl.simulation.newton import minimise
+from rafl.simulation.newton import MAX_ITERATIONS, minimise
 from rafl.simulation.parameters import Parameters
 from rafl.simulation.time_integration import INTEGRATORS
 from rafl.simulation.torch_engine import TorchEngine
@@ -145,9 +145,9 @@ class Simulator:
         beta = parameters.stiffness_damping.expand(batch)[:, None, None, None]
         return torch.stack([elastic, viscous, beta * elastic])
 
-    def constitutive_state(self, batch: int) -> ConstitutiveState:
-        """Elastic moduli of the material, without damping, for a batch."""
-        parameters = self.parameters()
+    def constitutive_state(self, batch: int, parameters: Parameters | None = None) -> ConstitutiveState:
+        """Elastic moduli of the material, or of other parameters, without damping, for a batch."""
+        parameters = parameters or self.parameters()
         energy = parameters.energy(batch)
         hourglass = self.hourglass_stiffness(parameters, batch)
         return ConstitutiveState(
@@ -156,9 +156,9 @@ class Simulator:
             energy_weights=None if energy is None else energy.contiguous().numpy(),  # as the kernels take them
         )
 
-    def elastic_gradient(self, q: Array) -> Array:
-        """Derivative of the elastic energy with respect to q [N], (B, N, 3)."""
-        return self.engine.evaluate(q, self.constitutive_state(len(q)), tangent=False)[1]
+    def elastic_gradient(self, q: Array, parameters: Parameters | None = None) -> Array:
+        """Derivative of the elastic energy with respect to q [N], (B, N, 3), with other parameters if given."""
+        return self.engine.evaluate(q, self.constitutive_state(len(q), parameters), tangent=False)[1]
 
     def minimise(
         self,
@@ -169,10 +169,11 @@ class Simulator:
         state: ConstitutiveState,
         label: str,
         factors: Factors | None = None,
+        max_iterations: int = MAX_ITERATIONS,
     ) -> Array:
         """`rafl.simulation.newton.minimise` with the engine of this specimen."""
         with self.engine.thread_limit(len(start)):
-            return minimise(self.engine, start, inertia, target, force, state, label, factors)
+            return minimise(self.engine, start, inertia, target, force, state, label, factors, max_iterations)
 
     def equilibrium(
         self,
