@@ -11,6 +11,7 @@ from late_rig import film, track
 from scipy.interpolate import CubicSpline, make_interp_spline
 from synthetic_tracks import tracks_of_pixels
 
+from rafl.calibration.camera import Plane
 from rafl.calibration.rig import Rig
 from rafl.capture.dataset.build import build_dataset
 from rafl.capture.dataset.camera_summary import camera_rows, camera_warnings
@@ -23,6 +24,7 @@ from rafl.capture.specimen.specimen import Specimen
 from rafl.common.errors import InputError
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset, write_dataset
+from rafl.fem.maxwell import branch_shares, branch_times
 from rafl.tracking.linking.layout import MarkerLayout
 from rafl.tracking.reconstruction.tracks import write_tracks
 from rafl.tracking.reconstruction.triangulation import CameraPixels
@@ -129,6 +131,23 @@ def test_what_is_found_adds_to_a_clock_that_is_known(tmp_path: Path, front: Spec
     assert np.nanstd(error[1:-1], axis=0).max() < 1e-5
     before = known.markers - moved(STEP * count[STILL:-1])
     assert np.nanstd(before[1:-1], axis=0).max() > 1e-4
+
+
+def test_a_rubber_that_hardly_creeps_turns_no_camera(tmp_path: Path, front: Specimen) -> None:
+    """Its loss factor is constant above 1 Hz only; the description has none."""
+    shares = tuple(branch_shares(torch.tensor(0.1, dtype=torch.float64), 1.0, 50.0).tolist())
+    rubber = replace(front.material, branch_shares=shares, branch_times=branch_times(1.0, 50.0))
+    swing = tip_load_release(front, rubber, 0.06, FRAMES, 1.0 / STEP).q
+    q = np.concatenate([np.repeat(swing[:1], STILL, axis=0), swing])
+    markers, random = front.markers(1e-6), np.random.default_rng(0)
+    camera = replace(side_camera(0.0), plane=Plane((0.0, 1.0, 0.0), 0.0, 5e-4))
+    exact = camera.project(markers.positions(torch.from_numpy(q)).numpy())
+    pixel = exact + random.normal(0.0, SIGMA_PX, exact.shape)
+    pixels = {"left": CameraPixels(pixel, np.full_like(pixel, SIGMA_PX))}
+    write_tracks(tmp_path / "swing.h5", tracks_of_pixels(markers.names, Rig({"left": camera}), pixels, 1.0 / STEP))
+    found = np.asarray(built(tmp_path, front, True).trajectories["swing"].attributes["camera_change_left"])
+    assert (np.abs(found[:3]) < 3.0 * found[7:10]).all()
+    assert found[17] < 2.0 * SIGMA_PX  # what remains [px]; with one loss factor for all frequencies, 0.41
 
 
 def test_changes_are_reported_and_kept(datasets: tuple[Dataset, Dataset], tmp_path: Path) -> None:
