@@ -137,7 +137,12 @@ class ForceSearch:
 
     def minimise(self, force: Array, pose: RigidTransform, start: Array | None, change: Array = UNCHANGED) -> Estimate:
         """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and change of the material."""
-        current = self.evaluate(force, pose, start, change)
+        try:
+            current = self.evaluate(force, pose, start, change)
+        except SimulationError:
+            if start is None:
+                raise
+            current = self.evaluate(force, pose, None, change)
         damping, growth = INITIAL_DAMPING, 2.0  # updated as by H. B. Nielsen
         for _ in range(MAX_ITERATIONS):
             gradient, hessian = self._normal_equations(current)
