@@ -97,9 +97,11 @@ def update_dataset(path: Path, dataset: Dataset) -> None:
     """Add a dataset's recordings to a file. They replace recordings of the same name; the others do not change.
 
     Raises:
-        InputError: the file is no dataset, or one of another specimen, frame rate or time integration.
+        InputError: the file is no dataset, or one of another specimen, frame rate or time integration, or somebody
+            else changes it at the same time.
         ValueError: parts of the dataset are inconsistent.
     """
+    version = _version(path)
     earlier = read_dataset(path)
     own, other = earlier.simulator, dataset.simulator
     if abs(other.time_step / own.time_step - 1.0) > MAX_RELATIVE_TIME_ERROR:
@@ -126,6 +128,17 @@ def update_dataset(path: Path, dataset: Dataset) -> None:
         for name in earlier.trajectories:
             if name not in dataset.trajectories:
                 old.copy(f"trajectories/{name}", file["trajectories"], name)
+        if _version(path) != version:
+            raise InputError(
+                f"expected {path} as this command has read it, found that another one has changed it since; run this "
+                "one again"
+            )
+
+
+def _version(path: Path) -> tuple[int, int]:
+    """What changes if a file is replaced or written; zeros if there is none."""
+    state = path.stat() if path.exists() else None
+    return (state.st_ino, state.st_mtime_ns) if state else (0, 0)
 
 
 def _write(file: h5py.File, dataset: Dataset, recipe: str) -> None:

@@ -11,6 +11,7 @@ from energies import gent
 from filmed_markers import filmed, side_camera
 
 from rafl.common.errors import InputError
+from rafl.data import dataset_file
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
 from rafl.fem.laws import LAWS, register_law
@@ -262,6 +263,26 @@ def test_update_replaces_or_adds_recordings_and_keeps_the_others(dataset: Datase
     assert content(path, "a") == before["a"]
     with pytest.raises(InputError, match=r"none\.h5"):
         update_dataset(tmp_path / "none.h5", dataset)
+
+
+def test_two_updates_at_once_lose_nothing(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """While one command has read the file and writes its own, another one has replaced it."""
+    path = tmp_path / "a.h5"
+    write_dataset(path, dataset)
+    write = dataset_file._write
+    e, f = (replace(dataset, trajectories={name: dataset.trajectories["a"]}) for name in "ef")
+
+    def interrupted(file: h5py.File, own: Dataset, recipe: str) -> None:
+        monkeypatch.setattr(dataset_file, "_write", write)
+        update_dataset(path, f)
+        write(file, own, recipe)
+
+    monkeypatch.setattr(dataset_file, "_write", interrupted)
+    with pytest.raises(InputError, match=r"a\.h5 as this command has read it, found that another one has changed it"):
+        update_dataset(path, e)
+    assert sorted(read_dataset(path).trajectories) == ["a", "b", "c", "d", "f"]
+    update_dataset(path, e)
+    assert sorted(read_dataset(path).trajectories) == ["a", "b", "c", "d", "e", "f"]
 
 
 def with_time_step(dataset: Dataset, step: float) -> Dataset:
