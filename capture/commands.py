@@ -50,7 +50,7 @@ from rafl.common.kernels import announce_compilation
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
 from rafl.data.markers import Markers
-from rafl.fem.material import modulus_hint
+from rafl.fem.material import modulus_hint, unit_hints
 
 UNUSED_FPS = 100.0  # of a recording at rest without times
 DRAWN_MM = 2.0  # largest distance from the skin of the mesh at which a marker is drawn [mm]
@@ -196,6 +196,8 @@ def describe_specimen(still: Path, given: SpecimenBody, lying: bool, unit: str |
     torch.set_num_threads(1)
     announce_compilation()
     body = given.read(specimen_name(out), out.parent)
+    for hint in unit_hints(body.material.youngs_modulus, body.material.density):
+        typer.echo(f"warning: {hint}", err=True)
     recording = read_recording(still, UNUSED_FPS, unit)
     try:
         sigma = MODULUS_SIGMA if given.youngs_modulus is None else MEASURED_SIGMA
@@ -279,7 +281,18 @@ def _built(
         try:
             return build_dataset(specimen, tracks, rows, settings, recipe, lambda: bar.advance(task), known)
         except SimulationError as error:
-            raise InputError(f"{error}; does the first frame show the specimen at rest?") from None
+            hints = unit_hints(specimen.material.youngs_modulus, specimen.material.density)
+            raise InputError(
+                "expected a first frame that a body as described can have, found none: "
+                + "; ".join(
+                    hints
+                    or [
+                        "check youngs_modulus (in Pa), the size, the clamp and at_mm in the specimen file, "
+                        "and that the first frame shows the specimen at rest"
+                    ]
+                )
+                + f". The simulation says: {error}"
+            ) from None
 
 
 def inspect(contents: Path | None, verify: Path | None) -> None:

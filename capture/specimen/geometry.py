@@ -16,7 +16,8 @@ from rafl.common.yaml_files import LARGEST, StrictModel
 from rafl.fem.mesh import HexMesh
 
 SURFACES = (".stl", ".obj", ".ply")
-MAX_GRID_CELLS = 2_000_000  # of a box, or of the grid around another shape
+MAX_GRID_CELLS = 2_000_000  # of the grid around a shape
+MAX_ELEMENTS = 200_000  # of a mesh; the factors of a compact one of so many fill some 10 GB of memory
 QUERY_SIZE = 50_000  # cell centres per containment query
 
 
@@ -67,12 +68,13 @@ class Geometry(StrictModel):
         if self.box_mm is not None:
             size = 1e-3 * np.array(self.box_mm)
             cells = np.array(self.cells or np.round(size / (1e-3 * (self.element_mm or 1.0))), dtype=float)
-            _check_count("geometry", cells)
+            _check_count("geometry", cells, MAX_ELEMENTS)
             return Solid(HexMesh.box(cells.astype(int), size), float(size.prod()))
         element = 1e-3 * (self.element_mm or 1.0)
         if self.surface is not None:
             return fill_surface(folder / self.surface, element, clamp)
         grid = _rectangle_grid(self.rectangles) if self.rectangles is not None else _ellipse_grid(self.ellipses or [])
+        _check_count("geometry", grid.sum(), MAX_ELEMENTS)
         return Solid(HexMesh.from_grid(grid, element), float(grid.sum() * element**3))
 
 
@@ -84,12 +86,12 @@ class Solid:
     volume: float
 
 
-def _check_count(label: str, cells: ArrayLike) -> None:
+def _check_count(label: str, cells: ArrayLike, most: int = MAX_GRID_CELLS) -> None:
     """Raise InputError for more cells (x, y, z) than a computer can simulate."""
     count = float(np.prod(np.asarray(cells, dtype=float)))
-    if not count <= MAX_GRID_CELLS:
+    if not count <= most:
         raise InputError(
-            f"{label}: expected at most {MAX_GRID_CELLS} elements, found {count:.6g}; choose a larger element_mm (and "
+            f"{label}: expected at most {most} elements, found {count:.6g}; choose a larger element_mm (and "
             "are all lengths in mm?)"
         )
 
@@ -158,6 +160,7 @@ def fill_surface(path: Path, element: float, clamp: str) -> Solid:
             f"surface {path}: expected elements in one piece, found {pieces} pieces of {1e3 * element:g} mm elements; "
             "choose a smaller element_mm"
         )
+    _check_count(f"surface {path}", inside.sum(), MAX_ELEMENTS)
     mesh = HexMesh.from_grid(inside, element)
     return Solid(HexMesh(mesh.vertices + origin, mesh.hexes), 1e-9 * float(surface.volume))
 

@@ -70,6 +70,8 @@ def describe_validation(error: pydantic.ValidationError) -> str:
     key = ".".join(str(part) for part in first["loc"] if not str(part).startswith("<")) or "the file"
     message = first["msg"].removeprefix("Value error, ")
     found = "" if first["type"] == "missing" or ", found " in message else f", found {first['input']!r:.80}"
+    if first["type"] in ("invalid_key", "too_long"):  # `nu: 0,45` in braces, or [22,5, 0, 20]
+        found += "; write decimals with a point, not a comma"
     others = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     return f"{key}: {message}{found}{others}"
 

@@ -34,16 +34,33 @@ def lame(youngs_modulus: Any, poissons_ratio: Any) -> tuple[Any, Any]:
 
 
 SOFTEST = 1e3  # Young's modulus [Pa] below which no silicone is; the softest on sale have some 10 kPa
+LIGHTEST = 10.0  # density [kg/m^3] below which no solid is that can be filmed; soft foams have some 20
 
 
 def modulus_hint(youngs_modulus: float) -> str:
     """A sentence about a Young's modulus [Pa] that looks as if it were given in kPa or MPa; else empty."""
     if youngs_modulus >= SOFTEST:
         return ""
+    unit, factor = ("kPa", 1e3) if youngs_modulus >= 1e-2 * SOFTEST else ("MPa", 1e6)
     return (
-        f"Young's modulus {youngs_modulus:g} Pa is below {SOFTEST:g} Pa, softer than any silicone; if it is in kPa, "
-        f"write {1e3 * youngs_modulus:g}"
+        f"Young's modulus {youngs_modulus:g} Pa is below {SOFTEST:g} Pa, softer than any silicone; if it is in {unit}, "
+        f"write {factor * youngs_modulus:g}"
     )
+
+
+def density_hint(density: float) -> str:
+    """A sentence about a density [kg/m^3] that looks as if it were given in g/cm^3; else empty."""
+    if density >= LIGHTEST:
+        return ""
+    return (
+        f"density {density:g} kg/m3 is below {LIGHTEST:g} kg/m3, lighter than any foam; if it is in g/cm3, write "
+        f"{1e3 * density:g}"
+    )
+
+
+def unit_hints(youngs_modulus: float, density: float) -> list[str]:
+    """`modulus_hint` and `density_hint` where they say something."""
+    return [hint for hint in (modulus_hint(youngs_modulus), density_hint(density)) if hint]
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Hexahedral meshes of specimens of different shapes."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -55,6 +56,12 @@ def test_filling_the_surface_of_a_box_gives_the_box_mesh(tmp_path: Path, suffix:
     np.testing.assert_allclose(solid.mesh.vertices, expected.vertices, atol=1e-9)
     np.testing.assert_array_equal(solid.mesh.hexes, expected.hexes)
     assert solid.volume == pytest.approx(9e-5)
+
+
+@pytest.mark.parametrize("shape", [{"box_mm": (90, 30, 30)}, {"rectangles": [(60, 60)] * 180}])
+def test_more_elements_than_fit_into_memory_are_refused(shape: dict[str, Any], tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"geometry: expected at most 200000 elements, found 648000; choose a larger"):
+        Geometry(element_mm=0.5, **shape).build_solid(tmp_path, "x-min")
 
 
 def test_filling_a_surface_keeps_its_position_and_volume(tmp_path: Path) -> None:

@@ -113,3 +113,13 @@ def test_a_marker_off_the_surface_is_refused_and_named(specimen_file: Path) -> N
     specimen_file.write_text(specimen_file.read_text().replace("at_mm: [28, 0, 13]", "at_mm: [28, -3, 13]"))
     with pytest.raises(InputError, match=r"marker La2 .* 3.00 mm off the surface, expected at most 2 mm"):
         read_specimen(specimen_file).markers(2e-3)
+
+
+@pytest.mark.parametrize(("right", "wrong"), [("poissons_ratio: 0.45", "poissons_ratio: 0,45"), ("[10, ", "[10,5, ")])
+def test_a_decimal_comma_is_named(right: str, wrong: str, tmp_path: Path) -> None:
+    text = (ROOT / "datasets/specimens/canonical.yaml").read_text()
+    assert right in text
+    path = tmp_path / "canonical.yaml"
+    path.write_text(text.replace(right, wrong, 1))
+    with pytest.raises(InputError, match="write decimals with a point, not a comma"):
+        read_specimen(path)
