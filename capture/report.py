@@ -54,7 +54,9 @@ the recorded pixels, beside the standard deviation of these.</p>
 </table>{% endif %}
 <h2>Young's modulus</h2>
 <p class="note">Each recording shows it twice: by the bend under the load that was released, and by the frequency of the
-swing. The two depend on different quantities: the load, or the frame rate and the density. Both take Poisson's ratio
+swing. The two depend on different quantities: the load, or the frame rate and the density. Rubber is stiffer in a swing
+than under a load that hangs for long, up to about 1.3 times. Both numbers are for finding mistakes;
+<code>rafl-fit</code> finds the modulus together with the damping. Both take Poisson's ratio
 {{ ratio }} from the specimen's description, which has a Young's modulus of {{ assumed }} kPa.
 {% if integration != "enhanced" %}Elements of <code>integration: {{ integration }}</code> add a resistance to bending
 that depends on Poisson's ratio and on the size of the elements, so the values hold with this ratio on this mesh only.

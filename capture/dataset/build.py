@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +83,7 @@ def build_dataset(
         return in_layout_order(recording, specimen, name, settings.names)
 
     recordings = {row.recording: read(row.recording) for row in rows}
+    _check_different(recordings)
     rest = None
     if settings.rest is not None:
         name = settings.rest.recording
@@ -141,6 +143,16 @@ def _common_time_step(recordings: dict[str, Recording]) -> float:
                 "recordings with different frame rates into different datasets"
             )
     return step
+
+
+def _check_different(recordings: dict[str, Recording]) -> None:
+    """Raise InputError if two recordings are one: it would count twice, or test a model on what it was fitted to."""
+    for (one, first), (other, second) in combinations(recordings.items(), 2):
+        if np.isfinite(first.position).any() and np.array_equal(first.position, second.position, equal_nan=True):
+            raise InputError(
+                f"recordings {one} and {other}: expected different recordings, found the same positions in every frame "
+                f"({first.source}; {second.source}); leave one of them out of the table"
+            )
 
 
 def _check_same_layout(markers: Markers, known: Markers) -> None:

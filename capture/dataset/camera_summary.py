@@ -23,6 +23,7 @@ MAX_SIGMAS = 3.0  # a larger change of the pixels is more than the calibration's
 # Squared length of a change of the pose, in standard deviations, that is exceeded by chance as rarely as 3 sigmas: of a
 # chi-squared distribution of six degrees of freedom.
 MAX_SQUARED_LENGTH = 20.1
+REFERENCE_CLOCK = 1e-5  # standard deviation below which a clock was not searched [frames]
 LEAST_CLOCK_ERROR = 0.05  # that is worth a warning [frames]
 OTHER_CAUSES = (
     "something else is wrong: the size, preset or material in the specimen file; the names of markers; or perspective, "
@@ -154,7 +155,7 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
                 name,
                 _pairs(np.degrees(value[:3]), np.degrees(sigma[:3])),
                 _pairs(1e3 * value[3:CLOCK], 1e3 * sigma[3:CLOCK]),
-                (f"{late:+.6f} +- {late_sigma:.1g} s", f"{frames:+.3f} +- {frames_sigma:.1g} frames"),
+                _clock(late, late_sigma, dataset.simulator.time_step),
                 (f"{moved:.3g} +- {moved_sigma:.2g} px", *known),
                 _remains(unexplained, scale, expected),
                 _touched(moved, own, length),
@@ -165,6 +166,13 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
     if all(row.explained for row in rows):
         return rows
     return [replace(row, touched=False, late=False) for row in rows]  # all cameras were found together
+
+
+def _clock(late: float, sigma: float, frame: float) -> tuple[str, str]:
+    """What to add to a time offset, with its standard deviation, in s and in frames of a length [s]."""
+    if sigma < REFERENCE_CLOCK * frame:
+        return ("reference", "of the others")
+    return (f"{late:+.6f} +- {sigma:.1g} s", f"{late / frame:+.3f} +- {sigma / frame:.1g} frames")
 
 
 def _off(clock: float, sigma: float) -> bool:

@@ -155,6 +155,7 @@ def test_changes_are_reported_and_kept(datasets: tuple[Dataset, Dataset], tmp_pa
     rows = {row.camera: row for row in camera_rows(read_dataset(tmp_path / "beam.h5"))}
     assert rows["right"].touched
     assert not rows["left"].touched
+    assert rows["left"].clock == ("reference", "of the others")
     clock, line = camera_warnings(datasets[1])
     assert clock.startswith("camera right: its clock was found off")
     seconds, frames = (float(clock.split(before)[1].split()[0]) for before in ("Add ", " s ("))
