@@ -50,9 +50,13 @@ from rafl.common.kernels import announce_compilation
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import damaged_parts, read_dataset, update_dataset, write_dataset
 from rafl.data.markers import Markers
-from rafl.fem.material import modulus_hint, unit_hints
+from rafl.fem.material import unit_hints
 
 UNUSED_FPS = 100.0  # of a recording at rest without times
+CHECK_FIRST_FRAME = (
+    "Check youngs_modulus (in Pa), the size, the clamp and at_mm in the specimen file, and that the first frame shows "
+    "the specimen at rest"
+)
 DRAWN_MM = 2.0  # largest distance from the skin of the mesh at which a marker is drawn [mm]
 
 
@@ -98,9 +102,9 @@ def render(
     require_writable(out)
     described = read_specimen(specimen)
     described.markers(1e-3 * DRAWN_MM, "or choose smaller elements: dots are drawn on the skin of the elements")
-    for modulus in (described.material.youngs_modulus, true.youngs_modulus):
-        if hint := modulus_hint(modulus):
-            typer.echo(hint, err=True)
+    moduli, density = (described.material.youngs_modulus, true.youngs_modulus), described.material.density
+    for hint in dict.fromkeys(hint for modulus in moduli for hint in unit_hints(modulus, density)):
+        typer.echo(hint, err=True)
     material = replace(described.material, youngs_modulus=true.youngs_modulus, poissons_ratio=true.poissons_ratio)
     with progress() as bar, new_content(out):
         task = bar.add_task("simulating", total=len(loads_g) + len(twists_deg))
@@ -281,18 +285,9 @@ def _built(
         try:
             return build_dataset(specimen, tracks, rows, settings, recipe, lambda: bar.advance(task), known)
         except SimulationError as error:
-            hints = unit_hints(specimen.material.youngs_modulus, specimen.material.density)
-            raise InputError(
-                "expected a first frame that a body as described can have, found none: "
-                + "; ".join(
-                    hints
-                    or [
-                        "check youngs_modulus (in Pa), the size, the clamp and at_mm in the specimen file, "
-                        "and that the first frame shows the specimen at rest"
-                    ]
-                )
-                + f". The simulation says: {error}"
-            ) from None
+            material = specimen.material
+            advice = "; ".join(unit_hints(material.youngs_modulus, material.density)) or CHECK_FIRST_FRAME
+            raise InputError(f"no first frame of the body as described could be simulated: {error}. {advice}") from None
 
 
 def inspect(contents: Path | None, verify: Path | None) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rafl.calibration.camera import Camera
-from rafl.capture.dataset.refine_cameras import Refinement
+from rafl.capture.dataset.refine_cameras import REFERENCE_SIGMA, Refinement
 from rafl.capture.dataset.registered import Registered
 from rafl.capture.registration.camera_change import CLOCK, CameraChange
 from rafl.common.errors import InputError
@@ -23,7 +23,6 @@ MAX_SIGMAS = 3.0  # a larger change of the pixels is more than the calibration's
 # Squared length of a change of the pose, in standard deviations, that is exceeded by chance as rarely as 3 sigmas: of a
 # chi-squared distribution of six degrees of freedom.
 MAX_SQUARED_LENGTH = 20.1
-REFERENCE_CLOCK = 1e-5  # standard deviation below which a clock was not searched [frames]
 LEAST_CLOCK_ERROR = 0.05  # that is worth a warning [frames]
 OTHER_CAUSES = (
     "something else is wrong: the size, preset or material in the specimen file; the names of markers; or perspective, "
@@ -170,7 +169,7 @@ def camera_rows(dataset: Dataset) -> list[CameraRow]:
 
 def _clock(late: float, sigma: float, frame: float) -> tuple[str, str]:
     """What to add to a time offset, with its standard deviation, in s and in frames of a length [s]."""
-    if sigma < REFERENCE_CLOCK * frame:
+    if sigma < 2.0 * REFERENCE_SIGMA * frame:
         return ("reference", "of the others")
     return (f"{late:+.6f} +- {sigma:.1g} s", f"{late / frame:+.3f} +- {sigma / frame:.1g} frames")
 

@@ -36,8 +36,7 @@ CLOCK_SIGMA, RELEASE_SIGMA = 0.5, 0.3  # [frames]
 SCALE_SIGMA = 1e-3  # of an image's scale: of a lens whose focus was touched, or of temperature
 REFERENCE_SIGMA = 1e-6  # of the first camera's clock, which the others' are told against [frames]
 LEAST_PLACE_SIGMA = 1e-7  # of a place that is exactly known [m]
-# A single loss factor would stand for rubbers that creep alike: of another one, what it settles to is several pixels
-# off, which a turned camera explains.
+# With one loss factor, a rubber that creeps otherwise settles several pixels away, as if the camera had turned.
 QUANTITIES = METHOD_QUANTITIES["sysid-branches"]
 RECORDINGS = 2  # of the largest and the least motion; more hardly tell more
 FRAME_SHARES = 0.4, 1.0  # a search over many oscillations starts near its end

@@ -17,12 +17,12 @@ from rafl.common.command_line import create_table
 from rafl.data.dataset import Dataset
 from rafl.data.dataset_file import read_dataset
 from rafl.fem.material import unit_hints
+from rafl.tracking.linking.layout import DEFAULT_SIGMA_MM
 
 MISPLACED_MM = 2.0  # farther from its description than a hand misplaces a dot: four usual standard deviations
-# Smallest common shift of all markers that is told [mm], and the least number of markers. Dots that a hand misplaced
-# scatter by more than half their mean.
-MOVED_ALIKE_MM, MOVED_ALIKE_MARKERS = 0.4, 6
-BAD_FIT_MM = 0.5  # root mean square distance of a first frame's markers from the body; the default of at_sigma_mm
+# Ratio of the mean of the markers' shifts to their scatter, and the least number of markers. Six dots that a hand has
+# misplaced exceed the ratio along one axis once in 150 specimens (Student's t), fewer dots more often.
+MOVED_ALIKE_RATIO, MOVED_ALIKE_MARKERS = 2.0, 6
 MANY_MISPLACED = 3  # so many may have one cause, the calibration
 # What the share of valid positions counts.
 VALID = (
@@ -88,8 +88,7 @@ def warnings(dataset: Dataset) -> list[str]:
     """Messages on misplaced markers, markers left out, frames that are not free, and quantities that contradict."""
     material = dataset.simulator.material
     units = [f"specimen {dataset.name}: {hint}" for hint in unit_hints(material.youngs_modulus, material.density)]
-    lines = list(units)
-    lines += _moved_alike(dataset) + _bad_fits(dataset)
+    lines = [*units, *_moved_alike(dataset), *_bad_fits(dataset)]
     moved = dataset.markers.moved
     distances = np.zeros(len(dataset.markers.names)) if moved is None else 1e3 * np.linalg.norm(moved, axis=1)
     off = [(name, mm) for name, mm in zip(dataset.markers.names, distances, strict=True) if mm > MISPLACED_MM]
@@ -133,7 +132,7 @@ def _moved_alike(dataset: Dataset) -> list[str]:
     if moved is None or len(moved) < MOVED_ALIKE_MARKERS:
         return []
     mean, scatter = 1e3 * moved.mean(axis=0), 1e3 * moved.std(axis=0)
-    alike = (np.abs(mean) > MOVED_ALIKE_MM) & (np.abs(mean) > 2.0 * scatter)
+    alike = (np.abs(mean) > DEFAULT_SIGMA_MM) & (np.abs(mean) > MOVED_ALIKE_RATIO * scatter)
     if not alike.any():
         return []
     along = ", ".join(f"{mean[k]:+.1f} mm along {'xyz'[k]}" for k in np.flatnonzero(alike))
@@ -147,14 +146,14 @@ def _moved_alike(dataset: Dataset) -> list[str]:
 def _bad_fits(dataset: Dataset) -> list[str]:
     """A message on first frames whose markers the model follows less well than their places are known."""
     fits = {name: item.attributes.get("fit_residual_mm") for name, item in dataset.trajectories.items()}
-    bad = {name: mm for name, mm in fits.items() if isinstance(mm, float) and mm > BAD_FIT_MM}
+    bad = {name: mm for name, mm in fits.items() if isinstance(mm, float) and mm > DEFAULT_SIGMA_MM}
     if not bad:
         return []
     listed = ", ".join(f"{name} {mm:.2f}" for name, mm in bad.items())
     return [
-        f"first frames whose markers are farther from the fitted body than {BAD_FIT_MM:g} mm, to which places of dots "
-        f"are usually known, in mm (root mean square): {listed}. Check at_mm, the size of the body and its clamp in "
-        f"the specimen file, and the names of the markers; or else {OTHER_SET_UP}"
+        f"first frames whose markers are farther from the fitted body than {DEFAULT_SIGMA_MM:g} mm, to which places of "
+        f"dots are usually known, in mm (root mean square): {listed}. Check at_mm, the size of the body and its clamp "
+        f"in the specimen file, and the names of the markers; or else {OTHER_SET_UP}"
     ]
 
 

@@ -136,7 +136,10 @@ class ForceSearch:
         return Estimate(frame, change, force, pose, q, residual, shape, objective)
 
     def minimise(self, force: Array, pose: RigidTransform, start: Array | None, change: Array = UNCHANGED) -> Estimate:
-        """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and change of the material."""
+        """Best estimate, from initial forces (N, 3), pose, node positions (N, 3) and change of the material.
+
+        Positions from which no equilibrium is found are left: the search then starts from the undeformed body.
+        """
         try:
             current = self.evaluate(force, pose, start, change)
         except SimulationError:
@@ -252,7 +255,7 @@ class ForceSearch:
     def _marker_slopes(self, current: Estimate) -> Array:
         """Derivatives of the measured markers along their axes by forces and material if fitted, (3 M', 3 L [+ 3])."""
         by_force = node_force_slopes(current.frame, current.q)
-        slopes = by_force[:, self.frame.nodes].reshape(len(by_force), -1)
+        slopes = on_loaded_nodes(self.frame, by_force)
         if self.with_material:
             loads = material_loads(self.frame.simulator, current.change, current.q)
             slopes = np.concatenate([slopes, np.tensordot(by_force, loads)], axis=1)
@@ -306,3 +309,8 @@ def node_force_slopes(frame: FirstFrame, q: Array) -> Array:
         rows[np.arange(len(measured)), :, frame.markers.quad[measured, corner]] += by_corner[:, :, corner]
     solved = frame.simulator.solve_tangent(q[None], np.moveaxis(rows.reshape(-1, *q.shape), 0, -1)[None])[0]
     return np.moveaxis(solved, -1, 0)  # the tangent is symmetric
+
+
+def on_loaded_nodes(frame: FirstFrame, by_force: Array) -> Array:
+    """The part of `node_force_slopes` (3 M', N, 3) by the forces on the loaded nodes [m/N], (3 M', 3 L)."""
+    return by_force[:, frame.nodes].reshape(len(by_force), -1)

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from rafl.capture.registration.first_frame import FirstFrame
-from rafl.capture.registration.force_search import Estimate, ForcePrior, ForceSearch, node_force_slopes
+from rafl.capture.registration.force_search import Estimate, ForcePrior, ForceSearch, node_force_slopes, on_loaded_nodes
 from rafl.capture.registration.mesh_error import ASSUMED, EXACT, ErrorSizes, MeshError
 from rafl.capture.registration.rigid import IDENTITY, RigidTransform
 
@@ -239,7 +239,7 @@ def fit_resultant(
     found = search.minimise(force, IDENTITY, start.q if start else None)
     modes, _ = frame.resultant_modes()
     by_force = node_force_slopes(frame, found.q)
-    jacobian = search.whitening @ by_force[:, frame.nodes].reshape(len(by_force), -1) @ modes
+    jacobian = search.whitening @ on_loaded_nodes(frame, by_force) @ modes
     amplitude = modes.T @ (found.force[frame.nodes].ravel() - frame.expected_force())
     return ResultantFit(found.force, found.q, found.residual, by_force, search.whitening, jacobian, amplitude, prior)
 
@@ -263,8 +263,7 @@ def fit_velocity(frame: FirstFrame, q: Array, velocity: Array, sigma: Array) -> 
         q: the mesh in the first frame [m], (N, 3).
         velocity, sigma: velocities of the markers and their sigmas [m/s], (M, 3); NaN and infinite if unknown.
     """
-    jacobian = node_force_slopes(frame, q)[:, frame.nodes]
-    jacobian = jacobian.reshape(len(jacobian), -1)
+    jacobian = on_loaded_nodes(frame, node_force_slopes(frame, q))
     velocity = frame.along_axes(np.where(np.isfinite(velocity), velocity, 0.0)[frame.measured]).ravel()
     if frame.axes is not None:
         sigma = np.where(np.isfinite(frame.sigma), np.sqrt((frame.axes**2 @ sigma[..., None] ** 2)[..., 0]), np.inf)

@@ -71,7 +71,7 @@ def describe_validation(error: pydantic.ValidationError) -> str:
     message = first["msg"].removeprefix("Value error, ")
     found = "" if first["type"] == "missing" or ", found " in message else f", found {first['input']!r:.80}"
     if first["type"] in ("invalid_key", "too_long"):  # `nu: 0,45` in braces, or [22,5, 0, 20]
-        found += "; write decimals with a point, not a comma"
+        found += "; if a comma is a decimal sign, write a point"
     others = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
     return f"{key}: {message}{found}{others}"
 

@@ -37,7 +37,7 @@ SOFTEST = 1e3  # Young's modulus [Pa] below which no silicone is; the softest on
 LIGHTEST = 10.0  # density [kg/m^3] below which no solid is that can be filmed; soft foams have some 20
 
 
-def modulus_hint(youngs_modulus: float) -> str:
+def _modulus_hint(youngs_modulus: float) -> str:
     """A sentence about a Young's modulus [Pa] that looks as if it were given in kPa or MPa; else empty."""
     if youngs_modulus >= SOFTEST:
         return ""
@@ -48,7 +48,7 @@ def modulus_hint(youngs_modulus: float) -> str:
     )
 
 
-def density_hint(density: float) -> str:
+def _density_hint(density: float) -> str:
     """A sentence about a density [kg/m^3] that looks as if it were given in g/cm^3; else empty."""
     if density >= LIGHTEST:
         return ""
@@ -59,8 +59,8 @@ def density_hint(density: float) -> str:
 
 
 def unit_hints(youngs_modulus: float, density: float) -> list[str]:
-    """`modulus_hint` and `density_hint` where they say something."""
-    return [hint for hint in (modulus_hint(youngs_modulus), density_hint(density)) if hint]
+    """Sentences about a Young's modulus [Pa] and a density [kg/m^3] that look as if given in other units."""
+    return [hint for hint in (_modulus_hint(youngs_modulus), _density_hint(density)) if hint]
 
 
 @dataclass(frozen=True)

@@ -57,17 +57,8 @@ def minimise(
     Raises:
         SimulationError: no convergence; names trajectory, residual and remedies.
     """
-    problem = (
-        engine,
-        start,
-        inertia,
-        target,
-        force,
-        state,
-        label,
-        factors or engine.allocate(len(start)),
-        max_iterations,
-    )
+    factors = factors or engine.allocate(len(start))
+    problem = (engine, start, inertia, target, force, state, label, factors, max_iterations)
     try:
         found = _minimise(*problem, MAX_STEP_EDGE_CHANGE)
     except SimulationError:

@@ -311,36 +311,6 @@ def test_a_marker_without_one_coordinate_is_missing(
     assert np.argwhere(~valid).tolist() == [[3, 2]]
 
 
-def test_one_recording_of_two_names_is_refused(small_specimen: Specimen, truth: np.ndarray, tmp_path: Path) -> None:
-    for name in ("q0", "q1"):
-        np.save(tmp_path / f"{name}.npy", 1e3 * truth)
-    rows = [
-        RecordingRow(recording="q0", load_g=60, split="train"),
-        RecordingRow(recording="q1", load_g=60, split="test"),
-    ]
-    with pytest.raises(
-        InputError, match=r"recordings q0 and q1: expected different recordings, found the same positions"
-    ):
-        build_dataset(small_specimen, tmp_path, rows, SETTINGS, "", lambda: None)
-
-
-@pytest.mark.parametrize(
-    ("unit", "hint"),
-    [
-        ({"youngs_modulus": 2.2e-1}, "if it is in MPa, write 220000"),
-        ({"youngs_modulus": 220.0}, "if it is in kPa, write 220000"),
-        ({"density": 1.07}, "if it is in g/cm3, write 1070"),
-    ],
-)
-def test_units_of_the_material_are_named(
-    unit: dict[str, float], hint: str, small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
-) -> None:
-    np.save(tmp_path / "q0.npy", 1e3 * truth)
-    built = build(small_specimen, tmp_path)
-    wrong = replace(built.simulator, material=replace(small_specimen.material, **unit))
-    assert warnings(replace(built, simulator=wrong))[0].endswith(hint)
-
-
 @pytest.mark.parametrize("least", [0.0, 1e-200])
 def test_an_impossible_sigma_is_refused(
     least: float, small_specimen: Specimen, truth: np.ndarray, tmp_path: Path
@@ -373,14 +343,6 @@ def test_a_dot_far_from_its_description_is_found_and_named(
     assert line.startswith("markers found far from their at_mm in the first frames, in mm: ")
     assert f"{layout.names[3]} 3.0. Correct at_mm" in line
     assert "the calibration belongs to another set-up" in line
-    alike = built.markers.moved + np.array([0.0, 0.0, -6e-4])
-    lines = warnings(replace(built, markers=replace(built.markers, moved=alike)))
-    assert lines[0].startswith(
-        "all markers were found moved alike from their at_mm in the first frames: -0.6 mm along z."
-    )
-    bad = replace(built.trajectories["q0"], attributes=built.trajectories["q0"].attributes | {"fit_residual_mm": 0.72})
-    lines = warnings(replace(built, trajectories={"q0": bad}))
-    assert "(root mean square): q0 0.72. Check at_mm" in lines[0]
     write_dataset(tmp_path / "small.h5", built)
     again = read_dataset(tmp_path / "small.h5").markers
     for key in ("rest", "moved", "place_sigma"):

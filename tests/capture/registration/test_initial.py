@@ -5,8 +5,11 @@ import pytest
 import torch
 from support import ROOT
 
+from rafl.capture.registration import force_search
 from rafl.capture.registration.first_frame import FirstFrame
-from rafl.capture.registration.initial import WEIGHT, fit_first_frame
+from rafl.capture.registration.force_search import ForceSearch
+from rafl.capture.registration.initial import PULL, WEIGHT, fit_first_frame
+from rafl.capture.registration.rigid import IDENTITY
 from rafl.capture.registration.sequence import fit_by_sequence
 from rafl.capture.specimen.specimen import Specimen, read_specimen
 from rafl.data.synthetic import load_force, loaded_equilibria, twisted_shapes
@@ -127,3 +130,16 @@ def test_the_sequence_of_forces_approaches_the_same_shape(small_specimen: Specim
     error = np.linalg.norm(by_sequence.q - truth, axis=1).max()
     assert error < 0.5 * np.linalg.norm(rest - truth, axis=1).max()
     assert np.linalg.norm(fit_first_frame(frame).q - truth, axis=1).max() < 0.1 * error
+
+
+def test_a_start_that_leads_to_no_equilibrium_is_left(
+    small_specimen: Specimen, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    simulator, markers = small_specimen.simulator(0.01), small_specimen.markers(1e-6)
+    target, sigma = markers.rest, np.full_like(markers.rest, 1e-5)
+    frame = FirstFrame(simulator, markers, small_specimen.loaded, target, sigma, "test")
+    search = ForceSearch(frame, PULL, np.eye(target.size), with_pose=False, with_material=False, pull=0.0)
+    monkeypatch.setattr(force_search, "MAX_NEWTON_ITERATIONS", 0)  # no start leads to one
+    rest = simulator.mesh.vertices
+    found = search.minimise(np.zeros_like(rest), IDENTITY, rest)
+    np.testing.assert_allclose(found.q, simulator.equilibrium(simulator.weight[None])[0], atol=1e-9)

@@ -121,5 +121,5 @@ def test_a_decimal_comma_is_named(right: str, wrong: str, tmp_path: Path) -> Non
     assert right in text
     path = tmp_path / "canonical.yaml"
     path.write_text(text.replace(right, wrong, 1))
-    with pytest.raises(InputError, match="write decimals with a point, not a comma"):
+    with pytest.raises(InputError, match="if a comma is a decimal sign, write a point"):
         read_specimen(path)
